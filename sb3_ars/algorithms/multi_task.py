@@ -1,0 +1,671 @@
+"""The SB3 shell that ARSSAC and ARSTQC share: tasks, buffers, the update, resets, saving and loading.
+
+Arithmetic lives in ``sb3_ars.core``; what happens when is ``ARSCallback``'s to say.
+"""
+
+from __future__ import annotations
+
+import io
+import pathlib
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, EventCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_ars.algorithms.task_log import TaskLog
+from sb3_ars.buffers import TaskReplayBuffer
+from sb3_ars.callbacks.ars import ARSCallback
+from sb3_ars.config import ARSConfig, ResetScope, RewardScaling
+from sb3_ars.core.objectives import ActorValue, Objective
+from sb3_ars.core.reset import reset_module_, reset_optimizer_
+from sb3_ars.core.reward_scale import RewardScale, RewardStatistics, parse_reward_scaling
+from sb3_ars.core.update import Hyperparameters, UpdateState, update
+from sb3_ars.envs import make_multitask_env
+from sb3_ars.errors import ConfigError, EnvContractError
+
+__all__ = ["MultiTaskOffPolicyAlgorithm"]
+
+Self = TypeVar("Self", bound="MultiTaskOffPolicyAlgorithm")
+
+_RANDOM_PHASE = 0.0125  # of the run: 25,000 of 2 million steps a task in the authors' code
+
+
+class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """SB3's off-policy algorithm with one replay buffer per task, scaled critic targets and resets.
+
+    An environment with ``task_names`` and ``task_of_env`` (``make_metaworld_env``, ``make_multitask_env``) is
+    multi-task; any other is one task and is treated as SB3 treats it, buffer included.
+
+    SB3's arguments come first and mean what they mean in ``stable_baselines3.SAC``, but for:
+
+    :param policy: ``"MlpPolicy"`` has the paper's networks by default; its options are ``ARSSACPolicy``'s
+    :param env: SB3 environment, ``VecEnv``, or Gymnasium ``VectorEnv``
+    :param buffer_size: transitions per task
+    :param learning_starts: environment steps, summed over environments, before the first update; ``"auto"`` is 1.25 %
+        of the run and at least one batch per task
+    :param batch_size: rows per task in each update
+    :param ent_coef: with several tasks there is one temperature per task
+    :param use_sde: refused; so are, with several tasks, ``n_steps > 1`` and ``optimize_memory_usage``
+
+    Ours are the fields of :class:`sb3_ars.config.ARSConfig`:
+
+    :param n_reset: number of resets, evenly spaced; ``None`` is 4 with several tasks, 0 with one
+    :param param_resets: environment steps at which to reset, instead of ``n_reset``
+    :param reward_scaling: ``"mean"`` (Eq. 6), ``"std"``, ``"normalization"``, ``"none"`` or numbers
+    :param reward_floor: mean rewards below it count as this much in Eq. 6
+    :param reset: ``"actor_critic"``, ``"critic"`` or ``"none"``
+    :param updates_after_reset: gradient steps right after a reset
+    :param actor_value: critics the actor's loss reads, ``"min"`` or ``"first"``
+    :raises ConfigError: if options contradict each other or the environment
+    """
+
+    actor: Any
+    critic: Any
+    critic_target: Any
+
+    # SAC's and TQC's, set by their constructors and _setup_model
+    log_ent_coef: th.Tensor | None
+    ent_coef_optimizer: th.optim.Adam | None
+    ent_coef_tensor: th.Tensor
+    target_entropy: Any
+    target_update_interval: int
+
+    # ARSConfig's fields, kept as plain attributes, which SB3 saves, loads and lets ``load(..., option=)`` replace
+    n_reset: int | None
+    param_resets: Sequence[int] | None
+    reward_scaling: RewardScaling | None
+    reward_floor: float
+    reset: ResetScope | None
+    updates_after_reset: int
+    actor_value: ActorValue
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int | str = "auto",
+        batch_size: int = 100,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        n_reset: int | None = None,
+        param_resets: Sequence[int] | None = None,
+        reward_scaling: RewardScaling | None = "mean",
+        reward_floor: float = 0.01,
+        reset: ResetScope | None = "actor_critic",
+        updates_after_reset: int = 1000,
+        actor_value: ActorValue = "min",
+    ) -> None:
+        config = ARSConfig(
+            n_reset, param_resets, reward_scaling, reward_floor, reset, updates_after_reset, actor_value
+        )
+        is_auto = _is_auto(learning_starts)
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]  # None is SB3's way to load without an environment
+            learning_rate,
+            buffer_size,
+            0 if is_auto else learning_starts,  # type: ignore[arg-type]  # _is_auto leaves an integer
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,  # type: ignore[call-arg]  # SAC or TQC comes next in the order of classes
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=dict(
+                policy_kwargs or {}
+            ),  # SB3 2.9.2 writes into the caller's (off_policy_algorithm.py)
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.__dict__.update(vars(config))
+        self._auto_learning_starts = 0 if is_auto else None  # what "auto" last came to
+        self.task_names: list[str] | None = None
+        self.task_of_env: list[int] = []
+        self.is_multi_task = False
+        self.n_resets = 0
+        self.last_reset_at = 0
+        self.reward_scale_is_set = False
+        self.reward_scale_history: list[tuple[int, list[float]]] = []
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------ construction
+
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if isinstance(env, gym.vector.VectorEnv):  # such as gym.make_vec("Meta-World/MT10")
+            env = make_multitask_env(env)
+        return OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+
+    def _setup_model(self) -> None:
+        self.config  # noqa: B018  # validates: load() replaces attributes after the constructor's own check
+        self._check_options()
+        self._read_tasks(self.env)
+        if self.is_multi_task and self._uses_task_buffer():
+            self.replay_buffer_class = self.replay_buffer_class or TaskReplayBuffer
+            if self.replay_buffer is None:
+                self.replay_buffer = self._make_task_buffer(self.replay_buffer_class)
+        super()._setup_model()
+        if self.log_ent_coef is not None and self.n_tasks > 1:
+            self._make_temperature_per_task(self.log_ent_coef)
+        self.reward_scale = RewardScale(self.n_tasks, self.device)
+        self._task_log = TaskLog(self.task_names or [], self._stats_window_size)
+        self._update_state = self._make_update_state()
+        self._last_dump_at = -1
+
+    @property
+    def config(self) -> ARSConfig:
+        """The options as the validated dataclass."""
+        return ARSConfig(**{name: getattr(self, name) for name in ARSConfig.__dataclass_fields__})
+
+    @property
+    def n_tasks(self) -> int:
+        """Number of tasks."""
+        return len(self.task_names) if self.task_names else 1
+
+    def _check_options(self) -> None:
+        if self.use_sde:
+            raise ConfigError(
+                "use_sde=True (gSDE) is not supported: the update draws plain Gaussian noise. Use False."
+            )
+        for option in ("batch_size", "buffer_size"):
+            value = getattr(self, option)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ConfigError(f"{option}={value!r} must be an integer of at least 1.")
+
+    def _read_tasks(self, env: VecEnv | None) -> None:
+        """Take names and order of the tasks from the environment, once; later environments must agree."""
+        if env is not None:
+            names = task_names_of(env)
+            self._check_same_tasks(names)
+            self.is_multi_task = names is not None
+            self.task_names = names
+            self.task_of_env = (
+                [0] * env.num_envs if names is None else [int(task) for task in env.task_of_env]  # type: ignore[attr-defined]
+            )
+        if not self.is_multi_task:
+            return
+        if self.n_steps > 1:
+            raise ConfigError(f"n_steps={self.n_steps} is not available with several tasks; use n_steps=1.")
+        if self.n_tasks > 1 and not self._uses_task_buffer():
+            raise ConfigError(
+                f"replay_buffer_class={self.replay_buffer_class!r} mixes the tasks; leave it None, which gives "
+                "TaskReplayBuffer, or pass a subclass of that."
+            )
+        normalizer = None if env is None else unwrap_vec_normalize(env)
+        if normalizer is not None and normalizer.norm_reward:
+            raise ConfigError(
+                "VecNormalize(norm_reward=True) normalises rewards with one statistic for all tasks; the reward scale "
+                "needs raw rewards. Use VecNormalize(norm_reward=False) and choose reward_scaling instead."
+            )
+        parse_reward_scaling(self.reward_scaling, self.task_names or ())
+        if self.batch_size > self.buffer_size:
+            raise ConfigError(
+                f"batch_size={self.batch_size} rows per task is more than buffer_size={self.buffer_size} per task "
+                "can ever hold; raise buffer_size or lower batch_size."
+            )
+
+    def _check_same_tasks(self, names: list[str] | None) -> None:
+        if self.task_names is not None and names != self.task_names:
+            given = "a plain environment" if names is None else f"tasks {names}"
+            raise ConfigError(
+                f"This model was made for the tasks {self.task_names}, in this order, but the environment has {given}. "
+                "Make the environment with the model's task list."
+            )
+
+    def _uses_task_buffer(self) -> bool:
+        return self.replay_buffer_class is None or issubclass(self.replay_buffer_class, TaskReplayBuffer)
+
+    def _make_task_buffer(self, buffer_class: Any) -> ReplayBuffer:
+        buffer: ReplayBuffer = buffer_class(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            task_of_env=self.task_of_env,
+            task_names=self.task_names,
+            seed=self.seed,
+            verbose=self.verbose,
+            **self.replay_buffer_kwargs,
+        )
+        return buffer
+
+    def _make_temperature_per_task(self, log_ent_coef: th.Tensor) -> None:
+        """Replace SB3's single temperature by one per task, started at the same value."""
+        self.log_ent_coef = log_ent_coef.detach().repeat(self.n_tasks).requires_grad_(True)
+        self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
+
+    def _make_update_state(self) -> UpdateState:
+        return UpdateState(
+            actor=self.actor,
+            critic=self.critic,
+            critic_target=self.critic_target,
+            actor_optimizer=self.actor.optimizer,
+            critic_optimizer=self.critic.optimizer,
+            log_ent_coef=self.log_ent_coef,
+            ent_coef=None if self.log_ent_coef is not None else self.ent_coef_tensor,
+            ent_coef_optimizer=self.ent_coef_optimizer,
+            norm_statistics=self.batch_norm_stats,  # type: ignore[attr-defined]  # SAC's and TQC's
+            norm_statistics_target=self.batch_norm_stats_target,  # type: ignore[attr-defined]
+        )
+
+    def _make_objective(self) -> Objective:
+        """Return SAC's or TQC's objective."""
+        raise AssertionError("a subclass names its objective")
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Replace the environment, as SB3 does; it must have the model's tasks in the model's order.
+
+        :param env: the new environment
+        :param force_reset: whether the next ``learn`` resets it first
+        :raises ConfigError: if its tasks differ
+        """
+        wrapped = self._wrap_env(env, self.verbose)
+        self._check_same_tasks(task_names_of(wrapped))
+        super().set_env(wrapped, force_reset)
+        self._read_tasks(self.env)
+        if isinstance(self.replay_buffer, TaskReplayBuffer):
+            self.replay_buffer.set_task_of_env(self.task_of_env)
+
+    # ------------------------------------------------------------------ learning
+
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for ``total_timesteps`` environment steps, summed over environments; SB3's ``learn``.
+
+        :param total_timesteps: environment steps; the reset times follow from it
+        :param callback: SB3 callbacks; ``ARSCallback`` is put before them unless one is among them
+        :param log_interval: episodes between two log entries
+        :param tb_log_name: name of the TensorBoard run; ``None`` is the class's name
+        :param reset_num_timesteps: whether the step counter starts at 0
+        :param progress_bar: whether to show one
+        :raises ConfigError: before the first step, if the options do not fit the run
+        """
+        super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=type(self).__name__ if tb_log_name is None else tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        starts_afresh = reset_num_timesteps or self.num_timesteps == 0
+        self._resolve_learning_starts(total_timesteps, starts_afresh)
+        if isinstance(self.replay_buffer, TaskReplayBuffer):
+            self.replay_buffer.check_memory()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _resolve_learning_starts(self, total_timesteps: int, starts_afresh: bool) -> None:
+        """Turn ``"auto"`` into a number of steps, and check that it fills one batch per task."""
+        rows_per_step = (
+            min(self.task_of_env.count(task) for task in set(self.task_of_env)) if self.task_of_env else 1
+        )
+        one_batch = -(-self.batch_size // rows_per_step) * self.n_envs
+        is_auto = (
+            self._auto_learning_starts is not None and self.learning_starts == self._auto_learning_starts
+        )
+        if is_auto and starts_afresh:  # a value assigned since, or given to load(), is not auto's and stays
+            self.learning_starts = max(int(_RANDOM_PHASE * total_timesteps), one_batch)
+            self._auto_learning_starts = self.learning_starts
+        if self.is_multi_task and starts_afresh and self.learning_starts < one_batch:
+            raise ConfigError(
+                f"learning_starts={self.learning_starts} steps in all give some task fewer rows than "
+                f"batch_size={self.batch_size}; use learning_starts={one_batch} or more, or a smaller batch_size."
+            )
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        given = CallbackList(callback) if isinstance(callback, list) else callback
+        if not any(isinstance(found, ARSCallback) for found in _walk(given)):
+            # before the others, so that a checkpoint or evaluation in the same step sees the networks after a reset
+            others = (
+                []
+                if given is None
+                else [given if isinstance(given, BaseCallback) else ConvertCallback(given)]
+            )
+            given = CallbackList([ARSCallback(), *others])
+        return super()._init_callback(given, progress_bar)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self._check_finite("observation", new_obs)
+        self._check_finite("reward", reward)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _check_finite(self, what: str, values: np.ndarray | dict[str, np.ndarray]) -> None:
+        """Raise before a NaN or an infinity reaches the buffer."""
+        for array in values.values() if isinstance(values, dict) else (values,):
+            if np.isfinite(array.sum(dtype=np.float64)):
+                continue
+            finite = np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+            if not finite.all():
+                env = int(np.flatnonzero(~finite)[0])
+                names = self.task_names or ["environment"]
+                raise EnvContractError(
+                    f"Task {names[self.task_of_env[env]]!r} (env {env}) gave NaN or infinity as {what} at step "
+                    f"{self.num_timesteps}: {array[env]}. It was not stored, and the model is as it was before."
+                )
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        if self.is_multi_task and dones is not None:
+            for env in np.flatnonzero(dones):
+                self._task_log.add_episode(self.task_of_env[env], infos[env])
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Do gradient steps on batches of ``batch_size`` rows per task.
+
+        :param gradient_steps: how many
+        :param batch_size: rows per task
+        """
+        if self._batch_is_missing(batch_size):
+            return
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+        hyperparameters = Hyperparameters(
+            self.gamma, self.tau, float(self.target_entropy), self._make_objective()
+        )
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            metrics = update(
+                self._update_state,
+                batch,
+                self._draw_noise(batch.actions),
+                self.reward_scale,
+                hyperparameters,
+                # counted over the whole run; SB3 2.9.2 counts within one train() call (sac.py), so 1 step never waits
+                update_target=self._n_updates % self.target_update_interval == 0,
+            )
+            self._n_updates += 1
+            self._task_log.add_update(metrics)
+
+    def _draw_noise(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return standard normal noise for the actions at s and at s', in the order SB3 draws it."""
+        return th.randn_like(actions), th.randn_like(actions)
+
+    def _batch_is_missing(self, batch_size: int) -> bool:
+        """Return whether updates must wait, which a run resumed without its buffer does; say so once."""
+        if not isinstance(self.replay_buffer, TaskReplayBuffer) or self.replay_buffer.size() >= batch_size:
+            return False
+        if not getattr(self, "_warned_of_waiting", False):
+            self._warned_of_waiting = True
+            warnings.warn(
+                f"Updates wait until every task holds batch_size={batch_size} rows; the replay buffer was not loaded "
+                "or is new. Use load_replay_buffer to continue a run exactly.",
+                stacklevel=2,
+            )
+        return True
+
+    # ------------------------------------------------------------------ the method's two actions
+
+    def update_reward_scale(self) -> None:
+        """Recompute c_i from the rewards each task's buffer holds now (Eq. 6).
+
+        With a plain single-task environment there is nothing to compare with: c = 1, or the number given.
+
+        :raises ConfigError: if the rule is undefined for the rewards seen; networks and buffers are untouched
+        """
+        rule = parse_reward_scaling(self.reward_scaling, self.task_names or ["environment"])
+        self.reward_scale.update_(*rule(self._reward_statistics(), self.reward_floor))
+        self.reward_scale_is_set = True
+        self.reward_scale_history.append((self.num_timesteps, self.reward_scale.scale.tolist()))
+
+    def reset_networks(self) -> None:
+        """Give the networks fresh weights in place, as ``reset`` says; buffers, counters and c_i stay.
+
+        ``"actor_critic"`` renews actor, critics, target critics, their optimizers and the temperatures; ``"critic"``
+        the critics, target critics and their optimizer. The global random generators are not touched.
+
+        Source: paper, Algorithm 1, line 16. Deviation: fresh weights at each reset, where the authors' code returns to
+        the same initial ones.
+        """
+        if self.reset in (None, "none"):
+            return
+        self.n_resets += 1
+        entropy = np.random.SeedSequence(None if self.seed is None else [self.seed, self.n_resets])
+        with th.random.fork_rng(devices=[self.device] if self.device.type == "cuda" else []):
+            th.manual_seed(int(entropy.generate_state(1)[0]))
+            fresh: Any = self.policy_class(
+                self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
+            ).to(self.device)
+        reset_module_(self.critic, fresh.critic)
+        reset_module_(self.critic_target, fresh.critic_target)
+        reset_optimizer_(self.critic.optimizer)
+        if self.reset == "actor_critic":
+            reset_module_(self.actor, fresh.actor)
+            reset_optimizer_(self.actor.optimizer)
+            self._reset_temperature()
+
+    def _reset_temperature(self) -> None:
+        if self.log_ent_coef is None or self.ent_coef_optimizer is None:
+            return
+        ent_coef = str(self.ent_coef)  # type: ignore[attr-defined]  # SAC's and TQC's: "auto" or "auto_0.1"
+        initial = float(ent_coef.split("_")[1]) if "_" in ent_coef else 1.0
+        with th.no_grad():
+            self.log_ent_coef.fill_(float(np.log(initial)))
+        reset_optimizer_(self.ent_coef_optimizer)
+
+    def _reward_statistics(self) -> RewardStatistics:
+        if isinstance(self.replay_buffer, TaskReplayBuffer):
+            return self.replay_buffer.reward_statistics()
+        return _plain_statistics(self.replay_buffer)
+
+    # ------------------------------------------------------------------ logging
+
+    def dump_logs(self) -> None:
+        """Write log data, at most once per environment step; this is where metrics leave the device."""
+        if self.num_timesteps == self._last_dump_at:
+            return  # SB3 asks once per ended episode, and the horizons of several tasks end together
+        self._last_dump_at = self.num_timesteps
+        self._task_log.record(self.logger, self._n_updates)
+        if self.is_multi_task:
+            assert isinstance(self.replay_buffer, TaskReplayBuffer)
+            self._task_log.record_scale(
+                self.logger, self.reward_scale.scale, self.replay_buffer.reward_statistics().mean
+            )
+        super().dump_logs()
+
+    # ------------------------------------------------------------------ prediction, saving, loading
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        task: str | int | None = None,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return actions, as SB3 does; ``task`` appends the one-hot id to observations that lack it.
+
+        :param observation: ``(obs_dim,)`` or ``(n, obs_dim)``
+        :param state: unused by these policies
+        :param episode_start: unused by these policies
+        :param deterministic: mean action instead of a sample
+        :param task: name or index of the task all rows belong to
+        :raises ConfigError: if the model has no such task
+        """
+        if task is not None:
+            observation = self._with_task(observation, task)
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def _with_task(self, observation: np.ndarray | dict[str, np.ndarray], task: str | int) -> np.ndarray:
+        names = self.task_names or []
+        index = names.index(task) if task in names else task
+        if isinstance(observation, dict) or isinstance(index, str) or not 0 <= index < len(names):
+            raise ConfigError(f"task={task!r} is not one of this model's tasks: {names}.")
+        one_hot = np.eye(len(names), dtype=np.float32)[index]
+        return np.concatenate(
+            (observation, np.broadcast_to(one_hot, (*observation.shape[:-1], len(names)))), axis=-1
+        )
+
+    @classmethod
+    def load(  # type: ignore[override]  # SB3 annotates self-typed class methods per class
+        cls: type[Self],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """Load a model, as SB3 does.
+
+        :param path: what ``save`` wrote
+        :param env: an environment with the same tasks in the same order, or ``None`` for prediction alone
+        :param kwargs: SB3's further arguments, or options to replace
+        :raises ConfigError: if the environment has other tasks
+        """
+        if env is not None:
+            env = cls._wrap_env(env)
+            _check_saved_tasks(path, task_names_of(env))
+        return super().load(path, env=env, **kwargs)
+
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True
+    ) -> None:
+        """Load a replay buffer, as SB3 does; it must hold the model's tasks.
+
+        :param path: what ``save_replay_buffer`` wrote
+        :param truncate_last_traj: SB3's, for hindsight buffers
+        :raises ConfigError: if its tasks differ; the model keeps the buffer it had
+        """
+        kept = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        if self.is_multi_task:
+            loaded = getattr(self.replay_buffer, "task_names", None)
+            if not isinstance(self.replay_buffer, TaskReplayBuffer) or list(loaded or ()) != self.task_names:
+                self.replay_buffer = kept
+                raise ConfigError(
+                    f"The replay buffer in {path} holds the tasks {loaded}, this model has {self.task_names}."
+                )
+            self.replay_buffer.set_task_of_env(self.task_of_env)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_update_state", "_task_log", "reward_scale"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return state_dicts, [*tensors, "reward_scale.scale", "reward_scale.shift"]
+
+
+def task_names_of(env: GymEnv) -> list[str] | None:
+    """Return the names of a multi-task environment's tasks, ``None`` for a plain one."""
+    names = getattr(env, "task_names", None)
+    return None if names is None else list(names)
+
+
+def _check_saved_tasks(path: str | pathlib.Path | io.BufferedIOBase, names: list[str] | None) -> None:
+    """Name the tasks before SB3 compares spaces, whose error shows two boxes of numbers."""
+    start = path.tell() if isinstance(path, io.IOBase) else None
+    data, _, _ = load_from_zip_file(path, device="cpu")
+    if start is not None:
+        path.seek(start)  # type: ignore[union-attr]  # a file, since start was read from it
+    saved = (data or {}).get("task_names")
+    if saved != names:
+        raise ConfigError(
+            f"{path} was trained on {_describe(saved)}, but the environment has {_describe(names)}. Make the "
+            "environment with the model's task list, in its order, or load without env to predict."
+        )
+
+
+def _describe(names: list[str] | None) -> str:
+    return "one plain environment" if names is None else f"the tasks {names}"
+
+
+def _plain_statistics(replay_buffer: ReplayBuffer | None) -> RewardStatistics:
+    assert replay_buffer is not None
+    rewards = th.as_tensor(replay_buffer.rewards[: replay_buffer.size()], dtype=th.float64)
+    return RewardStatistics(rewards.mean().reshape(1), rewards.std(correction=0).reshape(1), ("environment",))
+
+
+def _walk(callback: Any) -> Iterator[Any]:
+    """Yield a callback and those inside it."""
+    yield callback
+    if isinstance(callback, CallbackList):
+        for child in callback.callbacks:
+            yield from _walk(child)
+    elif isinstance(callback, EventCallback):
+        yield from _walk(callback.callback)
+
+
+def _is_auto(learning_starts: object) -> bool:
+    if learning_starts == "auto":
+        return True
+    if isinstance(learning_starts, bool) or not isinstance(learning_starts, int) or learning_starts < 0:
+        raise ConfigError(
+            f"learning_starts={learning_starts!r} must be 'auto' or a number of environment steps, summed over envs."
+        )
+    return False

@@ -1,0 +1,104 @@
+"""Per-task numbers for SB3's logger: episodes as they end, updates as tensors, read only when a log is written."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.logger import Logger
+
+from sb3_ars.core.update import Metrics
+
+__all__ = ["TaskLog", "log_names"]
+
+_STDOUT_WIDTH = 32  # SB3's table cuts keys to 36 characters, indentation included, and refuses two equal ones
+_STDOUT_TASKS = 10  # with more tasks, per-task rows go to CSV and TensorBoard alone
+
+
+class TaskLog:
+    """Collects what happened per task since the last log entry.
+
+    :param task_names: the tasks; empty for a plain environment, which gets SB3's keys alone
+    :param window: number of latest episodes per task that averages run over
+    """
+
+    def __init__(self, task_names: Sequence[str], window: int) -> None:
+        self.task_names = log_names(task_names)
+        self._episodes: list[deque[dict[str, float]]] = [deque(maxlen=window) for _ in task_names]
+        self._sums: Metrics | None = None
+        self._n_updates = 0
+
+    def add_episode(self, task: int, info: dict[str, Any]) -> None:
+        """Keep the return, length and success of an episode that ended.
+
+        :param task: index
+        :param info: of the episode's last step
+        """
+        episode = {"return": info["episode"]["r"]} if "episode" in info else {}
+        if "is_success" in info:
+            episode["success"] = float(info["is_success"])
+        self._episodes[task].append(episode)
+
+    def add_update(self, metrics: Metrics) -> None:
+        """Add one update's metrics to the running sums, on the device."""
+        self._sums = metrics if self._sums is None else Metrics(*map(th.add, self._sums, metrics))
+        self._n_updates += 1
+
+    def record(self, logger: Logger, n_updates: int) -> None:
+        """Write means since the last call under SB3's keys and, per task, ours.
+
+        :param logger: SB3's
+        :param n_updates: gradient steps of the whole run
+        """
+        for key, values in self._episode_means().items():
+            self._record_tasks(logger, key, values)
+            if key == "success":
+                logger.record("rollout/mean_success", float(np.nanmean(values)))
+        if self._sums is None:
+            return
+        actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value = (
+            (tensor / self._n_updates).tolist() for tensor in self._sums
+        )
+        logger.record("train/n_updates", n_updates, exclude="tensorboard")
+        logger.record("train/ent_coef", float(np.mean(ent_coef)))
+        logger.record("train/actor_loss", actor_loss)
+        logger.record("train/critic_loss", critic_loss)
+        logger.record("train/ent_coef_loss", ent_coef_loss)
+        if self.task_names:
+            self._record_tasks(logger, "q_value", q_value)
+            self._record_tasks(logger, "ent_coef", np.broadcast_to(ent_coef, len(self.task_names)).tolist())
+        self._sums, self._n_updates = None, 0
+
+    def record_scale(self, logger: Logger, reward_scale: th.Tensor, mean_reward: th.Tensor) -> None:
+        """Write c_i and the mean raw reward in each task's buffer.
+
+        :param logger: SB3's
+        :param reward_scale: ``(n_tasks,)``
+        :param mean_reward: ``(n_tasks,)``
+        """
+        self._record_tasks(logger, "reward_scale", reward_scale.tolist())
+        self._record_tasks(logger, "mean_reward", mean_reward.tolist())
+
+    def _episode_means(self) -> dict[str, list[float]]:
+        means = {}
+        for key in ("success", "return"):
+            values = [[e[key] for e in episodes if key in e] for episodes in self._episodes]
+            if any(values):
+                means[key] = [float(np.mean(v)) if v else float("nan") for v in values]
+        return means
+
+    def _record_tasks(self, logger: Logger, key: str, values: Sequence[float]) -> None:
+        exclude = "stdout" if len(self.task_names) > _STDOUT_TASKS else None
+        for name, value in zip(self.task_names, values, strict=True):
+            if not np.isnan(value):
+                logger.record(f"{key}/{name}", value, exclude=exclude)
+
+
+def log_names(task_names: Sequence[str]) -> list[str]:
+    """Return the names the log uses: the tasks' own, cut and numbered where SB3's table could not tell them apart."""
+    if all(len(name) <= _STDOUT_WIDTH for name in task_names):
+        return list(task_names)
+    return [f"{index}:{name}"[:_STDOUT_WIDTH] for index, name in enumerate(task_names)]

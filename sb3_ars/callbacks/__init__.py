@@ -1,0 +1,1 @@
+"""SB3 callbacks: the method's bookkeeping and evaluation."""

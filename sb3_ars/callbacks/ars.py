@@ -1,0 +1,98 @@
+"""Says when the reward scale is computed and when the networks are reset; how is the model's business."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, cast
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_ars.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
+
+__all__ = ["ARSCallback"]
+
+
+class ARSCallback(BaseCallback):
+    """Algorithm 1's bookkeeping, installed by ``learn()`` unless a callback of this class is passed.
+
+    After the random phase it has c_i computed; at each reset time it has c_i recomputed from the whole buffers, the
+    networks reset, and ``updates_after_reset`` gradient steps done. Everything happens between two rollouts, where the
+    newest transition is stored. What it remembers lives on the model, so it survives saving.
+
+    To change the schedule, subclass it and override :meth:`reset_is_due` or :meth:`reset`.
+
+    :param verbose: 1 prints each reset and the scales
+    """
+
+    def __init__(self, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self.reset_times: list[int] = []
+
+    @property
+    def algorithm(self) -> MultiTaskOffPolicyAlgorithm:
+        """The model, typed."""
+        return cast("MultiTaskOffPolicyAlgorithm", self.model)
+
+    def _on_training_start(self) -> None:
+        model = self.algorithm
+        self.verbose = max(self.verbose, model.verbose)
+        if model.num_timesteps == 0:
+            model.last_reset_at = 0
+        self.reset_times = model.config.reset_times(model._total_timesteps, model.n_tasks)
+        self._check_reset_times()
+
+    def _check_reset_times(self) -> None:
+        model, times = self.algorithm, self.reset_times
+        if not times:
+            return
+        if times[0] <= model.learning_starts or len(set(times)) < len(times):
+            option = "n_reset" if model.param_resets is None else "param_resets"
+            raise ConfigError(
+                f"{option} asks for {len(times)} resets in {model._total_timesteps} steps, the first at step "
+                f"{times[0]}, but the random phase alone takes {model.learning_starts} steps (learning_starts). "
+                f"Train longer, reset less often ({option}=0 or [] for never), or set learning_starts."
+            )
+        if times[-1] >= model._total_timesteps:
+            warnings.warn(
+                f"param_resets={times} reaches beyond this call's {model._total_timesteps} steps; those resets do not "
+                "happen in it.",
+                stacklevel=2,
+            )
+
+    def _on_rollout_start(self) -> None:
+        if self.reset_is_due():
+            self.reset()
+
+    def _on_rollout_end(self) -> None:
+        model = self.algorithm
+        if not model.reward_scale_is_set and model.num_timesteps > model.learning_starts:
+            model.update_reward_scale()  # Algorithm 1, line 8
+            self._print_scale("after the random phase")
+
+    def _on_step(self) -> bool:
+        return True
+
+    def reset_is_due(self) -> bool:
+        """Return whether a reset time has come since the last reset."""
+        model = self.algorithm
+        return any(model.last_reset_at < time <= model.num_timesteps for time in self.reset_times)
+
+    def reset(self) -> None:
+        """Recompute c_i, reset the networks, do the extra updates (Algorithm 1, lines 14 to 17)."""
+        model = self.algorithm
+        model.update_reward_scale()
+        model.reset_networks()
+        model.last_reset_at = model.num_timesteps
+        self._print_scale(f"reset {model.n_resets} of {len(self.reset_times)}")
+        if model.updates_after_reset > 0:
+            model.train(gradient_steps=model.updates_after_reset, batch_size=model.batch_size)
+
+    def _print_scale(self, event: str) -> None:
+        model = self.algorithm
+        if self.verbose < 1 or not model.is_multi_task:
+            return
+        scales = zip(model.task_names or [], model.reward_scale.scale.tolist(), strict=True)
+        print(f"Step {model.num_timesteps:,}, {event}: " + ", ".join(f"{n} c={c:.3g}" for n, c in scales))

@@ -1,0 +1,104 @@
+"""The method's own options, checked once; the API, the command and the presets build the same dataclass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from sb3_ars.core.objectives import ActorValue
+from sb3_ars.core.reward_scale import parse_reward_scaling
+from sb3_ars.errors import ConfigError, nearest
+
+__all__ = ["ARSConfig", "ResetScope", "RewardScaling"]
+
+ResetScope = Literal["actor_critic", "critic", "none"]
+RewardScaling = Literal["mean", "std", "normalization", "none"] | float | tuple[float, ...] | dict[str, float]
+
+
+@dataclass(frozen=True)
+class ARSConfig:
+    """Options of adaptive reward scaling and resets.
+
+    :raises ConfigError: naming the option, what was given and what is allowed
+    """
+
+    n_reset: int | None = None
+    """Number of resets, evenly spaced over the run; None is 4 with several tasks (the paper's MT10), 0 with one."""
+    param_resets: Sequence[int] | None = None
+    """Environment steps at which to reset, instead of n_reset (SBX's name)."""
+    reward_scaling: RewardScaling | None = "mean"
+    """"mean" (Eq. 6), "std", "normalization" (Table 5), "none", one number, or one per task (list or {name: c})."""
+    reward_floor: float = 0.01
+    """Mean rewards below this count as this much in Eq. 6, in units of reward."""
+    reset: ResetScope | None = "actor_critic"
+    """What a reset renews: "actor_critic" (temperatures too), "critic", or "none"."""
+    updates_after_reset: int = 1000
+    """Gradient steps on the kept buffers right after a reset."""
+    actor_value: ActorValue = "min"
+    """Critics the actor's loss reads: "min" (SB3) or "first" (the authors' code)."""
+
+    def __post_init__(self) -> None:
+        if self.n_reset is not None:
+            _check_integer("n_reset", self.n_reset, minimum=0)
+        if self.n_reset is not None and self.param_resets is not None:
+            raise ConfigError(
+                f"n_reset={self.n_reset} and param_resets={list(self.param_resets)} both say when to reset; give one."
+            )
+        _check_integer("updates_after_reset", self.updates_after_reset, minimum=0)
+        _check_positive("reward_floor", self.reward_floor)
+        _check_choice("reset", self.reset, (*get_args(ResetScope), None))
+        _check_choice("actor_value", self.actor_value, get_args(ActorValue))
+        if self.param_resets is not None:
+            _check_param_resets(self.param_resets)
+        if isinstance(self.reward_scaling, str):  # numbers are checked once the tasks are known
+            parse_reward_scaling(self.reward_scaling, ())
+
+    def resets(self) -> bool:
+        """Return whether resets renew anything."""
+        return self.reset not in (None, "none")
+
+    def reset_times(self, total_timesteps: int, n_tasks: int) -> list[int]:
+        """Return the environment steps, summed over environments, at which resets are due.
+
+        :param total_timesteps: length of the whole run in environment steps
+        :param n_tasks: number of tasks
+
+        Source: paper, Algorithm 1; the spacing T / (n_reset + 1) is the authors' code's.
+        """
+        if not self.resets():
+            return []
+        if self.param_resets is not None:
+            return [int(step) for step in self.param_resets]
+        n_reset = self.n_reset
+        if n_reset is None:
+            n_reset = 4 if n_tasks > 1 else 0
+        return [total_timesteps * (k + 1) // (n_reset + 1) for k in range(n_reset)]
+
+
+def _check_integer(option: str, value: object, minimum: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
+        raise ConfigError(f"{option}={value!r} must be an integer of at least {minimum}.")
+
+
+def _check_positive(option: str, value: object) -> None:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (is_number and 0 < value < float("inf")):  # type: ignore[operator]  # checked on the line above
+        raise ConfigError(f"{option}={value!r} must be a positive number.")
+
+
+def _check_choice(option: str, value: object, allowed: Sequence[str | None]) -> None:
+    if value not in allowed:
+        names = [name for name in allowed if name is not None]
+        raise ConfigError(
+            f"{option}={value!r} is unknown; choose one of {names}." + nearest(str(value), names)
+        )
+
+
+def _check_param_resets(param_resets: object) -> None:
+    if isinstance(param_resets, str) or not isinstance(param_resets, Sequence):
+        raise ConfigError(f"param_resets={param_resets!r} must be a list of environment steps.")
+    for step in param_resets:
+        _check_integer("param_resets entry", step, minimum=1)
+    if list(param_resets) != sorted(set(param_resets)):
+        raise ConfigError(f"param_resets={list(param_resets)} must increase from entry to entry.")

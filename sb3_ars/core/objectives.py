@@ -1,0 +1,103 @@
+"""What SAC and TQC do not share: the next value, the critic's loss and the value the actor climbs.
+
+Critic outputs have shape ``(rows, n_critics, n_outputs)``; rows are task-major, ``n_outputs`` is 1 for SAC.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch as th
+
+__all__ = ["ActorValue", "Objective", "SACObjective", "TQCObjective", "quantile_huber_loss"]
+
+ActorValue = Literal["min", "first"]
+"""Which critics the actor's loss reads: SB3's reduction over all of them, or the first alone."""
+
+
+class Objective(Protocol):
+    """The three places where algorithms differ."""
+
+    def next_value(self, q: th.Tensor) -> th.Tensor:
+        """Return ``(rows, m)`` from the target critics' ``(rows, n_critics, n_outputs)``."""
+
+    def loss(self, q: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """Return a tensor with rows first whose mean over all elements is the critics' loss.
+
+        :param q: ``(rows, n_critics, n_outputs)``
+        :param target: ``(rows, m)``, as :meth:`next_value` gave it
+        """
+
+    def actor_value(self, q: th.Tensor) -> th.Tensor:
+        """Return ``(rows, 1)``, what the actor maximises, from ``(rows, n_critics, n_outputs)``."""
+
+
+@dataclass(frozen=True)
+class SACObjective:
+    """Clipped double Q-learning.
+
+    :param actor_value_of: ``"min"`` over the critics (SB3) or the ``"first"`` alone (the authors' code)
+
+    Source: SAC (Haarnoja et al. 2018), with SB3's factor 1/2 on the loss.
+    """
+
+    actor_value_of: ActorValue = "min"
+
+    def next_value(self, q: th.Tensor) -> th.Tensor:
+        """Return the minimum over the critics, ``(rows, 1)``."""
+        return q.min(dim=1).values
+
+    def loss(self, q: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """Return 1/2 sum_j (Q_j - y)^2 for each row, ``(rows, 1)``."""
+        return 0.5 * (q - target.unsqueeze(1)).pow(2).sum(dim=1)
+
+    def actor_value(self, q: th.Tensor) -> th.Tensor:
+        """Return the minimum over the critics, or the first, ``(rows, 1)``."""
+        return q.min(dim=1).values if self.actor_value_of == "min" else q[:, 0]
+
+
+@dataclass(frozen=True)
+class TQCObjective:
+    """Truncated mixture of quantile critics.
+
+    :param n_quantiles_to_drop: how many of the largest pooled target quantiles are dropped, over all critics
+    :param actor_value_of: ``"min"`` here means the mean over critics and quantiles (TQC's own), ``"first"`` the
+        first critic's mean
+
+    Source: TQC (Kuznetsov et al. 2020), reductions as in sb3-contrib.
+    """
+
+    n_quantiles_to_drop: int
+    actor_value_of: ActorValue = "min"
+
+    def next_value(self, q: th.Tensor) -> th.Tensor:
+        """Return the smallest pooled quantiles, sorted, ``(rows, kept)``."""
+        pooled, _ = th.sort(q.reshape(q.shape[0], -1))
+        return pooled[:, : pooled.shape[1] - self.n_quantiles_to_drop]
+
+    def loss(self, q: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """Return the quantile Huber loss element by element, ``(rows, n_critics, n_quantiles, kept)``."""
+        return quantile_huber_loss(q, target)
+
+    def actor_value(self, q: th.Tensor) -> th.Tensor:
+        """Return the mean over quantiles and critics, or over the first critic's quantiles, ``(rows, 1)``."""
+        per_critic = q.mean(dim=2)
+        return per_critic.mean(dim=1, keepdim=True) if self.actor_value_of == "min" else per_critic[:, :1]
+
+
+def quantile_huber_loss(quantiles: th.Tensor, target: th.Tensor) -> th.Tensor:
+    """Return |tau_k - 1{y_m < q_k}| * huber(y_m - q_k) for every pair, unreduced.
+
+    :param quantiles: ``(rows, n_critics, n_quantiles)``
+    :param target: ``(rows, m)``
+    :return: ``(rows, n_critics, n_quantiles, m)``
+
+    Source: Dabney et al. 2018, Eq. 9 and 10, with kappa = 1 and midpoints tau_k = (k + 1/2) / n_quantiles.
+    """
+    n_quantiles = quantiles.shape[-1]
+    midpoint = (th.arange(n_quantiles, device=quantiles.device, dtype=th.float) + 0.5) / n_quantiles
+    error = target[:, None, None, :] - quantiles.unsqueeze(-1)
+    magnitude = error.abs()
+    huber = th.where(magnitude > 1, magnitude - 0.5, error**2 * 0.5)
+    return (midpoint[:, None] - (error.detach() < 0).float()).abs() * huber

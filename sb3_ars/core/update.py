@@ -1,0 +1,239 @@
+"""One gradient step of temperatures, critics, actor and targets: a pure function of its arguments.
+
+It reads no counter, logger or generator, never waits for the device, and gives its metrics as tensors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import torch as th
+
+from sb3_ars.core.objectives import Objective
+from sb3_ars.core.reward_scale import RewardScale
+from sb3_ars.core.targets import soft_target
+from sb3_ars.core.temperature import per_row, temperature_loss
+
+__all__ = ["Batch", "Hyperparameters", "Metrics", "UpdateState", "squashed_gaussian", "update"]
+
+
+class Actor(Protocol):
+    """What the update needs of an actor; SB3's ``Actor`` has it."""
+
+    def get_action_dist_params(self, obs: Any) -> tuple[th.Tensor, th.Tensor, dict[str, Any]]:
+        """Return mean and log standard deviation, each ``(rows, action_dim)``, and extras the update ignores."""
+
+
+class Critic(Protocol):
+    """What the update needs of the critics."""
+
+    def q_values(self, obs: Any, actions: th.Tensor) -> th.Tensor:
+        """Return ``(rows, n_critics, n_outputs)``."""
+
+
+class Batch(Protocol):
+    """One batch, rows task-major with equal counts per task; SB3's ``ReplayBufferSamples`` fits."""
+
+    @property
+    def observations(self) -> Any:
+        """``(rows, obs_dim)``, or SB3's dictionary of tensors."""
+
+    @property
+    def actions(self) -> th.Tensor:
+        """``(rows, action_dim)``, in [-1, 1]."""
+
+    @property
+    def next_observations(self) -> Any:
+        """Like ``observations``."""
+
+    @property
+    def dones(self) -> th.Tensor:
+        """``(rows, 1)``, 1 for terminations, not for time limits."""
+
+    @property
+    def rewards(self) -> th.Tensor:
+        """``(rows, 1)``, raw."""
+
+    @property
+    def discounts(self) -> th.Tensor | None:
+        """``(rows, 1)`` for n-step returns, otherwise ``None``."""
+
+
+@dataclass
+class UpdateState:
+    """The tensors one update changes, all in place.
+
+    :param actor: policy network
+    :param critic: critics
+    :param critic_target: their slowly moving copies
+    :param actor_optimizer: steps the parameters it holds
+    :param critic_optimizer: steps the parameters it holds
+    :param log_ent_coef: ``(n_tasks,)`` lambda_i, or ``None`` where the temperature is fixed
+    :param ent_coef: the fixed temperature, a scalar tensor; read only where ``log_ent_coef`` is ``None``
+    :param ent_coef_optimizer: steps ``log_ent_coef``
+    :param norm_statistics: running statistics of batch-norm layers in the critics
+    :param norm_statistics_target: the same of the target critics
+    """
+
+    actor: Actor
+    critic: Critic
+    critic_target: Critic
+    actor_optimizer: th.optim.Optimizer
+    critic_optimizer: th.optim.Optimizer
+    log_ent_coef: th.Tensor | None
+    ent_coef: th.Tensor | None
+    ent_coef_optimizer: th.optim.Optimizer | None
+    norm_statistics: Sequence[th.Tensor] = ()
+    norm_statistics_target: Sequence[th.Tensor] = ()
+
+    def __post_init__(self) -> None:
+        assert isinstance(self.critic, th.nn.Module) and isinstance(self.critic_target, th.nn.Module)
+        self.critic_parameters: list[th.Tensor] = list(self.critic.parameters())
+        self.target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """The numbers of one update.
+
+    :param discount: gamma, in [0, 1]
+    :param tau: weight of the new critics in the target, in (0, 1]
+    :param target_entropy: H, in nats
+    :param objective: SAC's or TQC's
+    """
+
+    discount: float
+    tau: float
+    target_entropy: float
+    objective: Objective
+
+
+class Metrics(NamedTuple):
+    """What one update reports, detached and on the device."""
+
+    actor_loss: th.Tensor  # ()
+    critic_loss: th.Tensor  # ()
+    ent_coef_loss: th.Tensor  # (), 0 where the temperature is fixed
+    ent_coef: th.Tensor  # (n_tasks,) or (1,), the one used in this update
+    q_value: (
+        th.Tensor
+    )  # (n_tasks,), mean of Q(s, a) over critics, outputs and the task's rows, in scaled reward
+
+
+def update(
+    state: UpdateState,
+    batch: Batch,
+    noise: tuple[th.Tensor, th.Tensor],
+    reward_scale: RewardScale,
+    hyperparameters: Hyperparameters,
+    update_target: bool = True,
+) -> Metrics:
+    """Change ``state`` by one gradient step on ``batch``.
+
+    Order: temperatures, critics, actor (through the new critics, with the action sampled first), targets.
+
+    :param state: changed in place
+    :param batch: raw rewards
+    :param noise: two standard normal tensors ``(rows, action_dim)``, for the actions at s and at s'
+    :param reward_scale: c_i
+    :param hyperparameters: constants
+    :param update_target: whether the target critics move in this step
+
+    Source: paper, Eq. 3, 4 and 7; with one task, c = 1 and SB3's networks it is SB3's ``SAC.train``, or sb3-contrib's
+    ``TQC.train``, to the bit.
+    """
+    objective = hyperparameters.objective
+    n_rows = batch.rewards.shape[0]
+    actions_pi, log_prob = squashed_gaussian(state.actor, batch.observations, noise[0])
+
+    ent_coef, ent_coef_loss = _step_temperature(state, log_prob, hyperparameters.target_entropy)
+    row_ent_coef = per_row(ent_coef, n_rows)
+
+    with th.no_grad():
+        next_actions, next_log_prob = squashed_gaussian(state.actor, batch.next_observations, noise[1])
+        next_q = state.critic_target.q_values(batch.next_observations, next_actions)
+        discount = hyperparameters.discount if batch.discounts is None else batch.discounts
+        target = soft_target(
+            batch.rewards,
+            batch.dones,
+            discount,
+            objective.next_value(next_q),
+            row_ent_coef,
+            next_log_prob,
+            reward_scale,
+        )
+    q = state.critic.q_values(batch.observations, batch.actions)
+    critic_loss = objective.loss(q, target).mean()
+    _step(state.critic_optimizer, critic_loss)
+
+    q_pi = state.critic.q_values(batch.observations, actions_pi)
+    actor_loss = (row_ent_coef * log_prob - objective.actor_value(q_pi)).mean()
+    _step(state.actor_optimizer, actor_loss)
+
+    if update_target:
+        _move_target(state, hyperparameters.tau)
+    n_tasks = reward_scale.scale.shape[0]
+    return Metrics(
+        actor_loss.detach(),
+        critic_loss.detach(),
+        ent_coef_loss,
+        ent_coef,
+        q.detach().reshape(n_tasks, -1).mean(dim=1),
+    )
+
+
+def squashed_gaussian(actor: Actor, obs: Any, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Return actions tanh(mean + std * noise) in [-1, 1] and their log probabilities.
+
+    :param actor: gives mean and log std
+    :param obs: ``(rows, obs_dim)``
+    :param noise: ``(rows, action_dim)``, standard normal
+    :return: ``(rows, action_dim)`` and ``(rows, 1)``
+
+    Source: SAC (Haarnoja et al. 2018), appendix C, with SB3's epsilon of 1e-6.
+    """
+    mean, log_std, _ = actor.get_action_dist_params(obs)
+    std = log_std.exp()
+    gaussian = mean + noise * std
+    actions = th.tanh(gaussian)
+    # log pi = sum_d log N(u_d; mean_d, std_d) - log(1 - tanh(u_d)^2 + eps), torch's Normal term by term: same bits
+    log_density = -((gaussian - mean) ** 2) / (2 * std**2) - std.log() - _LOG_SQRT_2_PI
+    log_prob = log_density.sum(dim=1) - th.log(1 - actions**2 + 1e-6).sum(dim=1)
+    return actions, log_prob.reshape(-1, 1)
+
+
+_LOG_SQRT_2_PI = math.log(math.sqrt(2 * math.pi))
+
+
+def _step_temperature(
+    state: UpdateState, log_prob: th.Tensor, target_entropy: float
+) -> tuple[th.Tensor, th.Tensor]:
+    """Return the temperatures before the step, ``(n_tasks,)`` or ``(1,)``, and the loss of the step."""
+    if state.log_ent_coef is None or state.ent_coef_optimizer is None:
+        assert state.ent_coef is not None
+        return state.ent_coef.reshape(1), th.zeros((), device=log_prob.device)
+    ent_coef = th.exp(state.log_ent_coef.detach())
+    loss = temperature_loss(state.log_ent_coef, log_prob, target_entropy)
+    _step(state.ent_coef_optimizer, loss)
+    return ent_coef, loss.detach()
+
+
+def _step(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
+    """Step the optimizer's own parameters; gradients of other parameters in the graph are not computed."""
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    gradients = th.autograd.grad(loss, parameters, allow_unused=True)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient
+    optimizer.step()
+
+
+@th.no_grad()
+def _move_target(state: UpdateState, tau: float) -> None:
+    # target = (1 - tau) target + tau critic
+    th._foreach_mul_(state.target_parameters, 1 - tau)
+    th._foreach_add_(state.target_parameters, state.critic_parameters, alpha=tau)
+    for target, statistic in zip(state.norm_statistics_target, state.norm_statistics, strict=True):
+        target.copy_(statistic)

@@ -1,0 +1,796 @@
+"""Steps Gymnasium envs into NumPy arrays, here or in processes; must not know torch, SB3 or the learner."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import mmap
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing import connection
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, Literal, NamedTuple, NoReturn, Protocol
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
+
+__all__ = [
+    "Ended",
+    "EnvFactory",
+    "EnvFacts",
+    "EnvRunner",
+    "StepArrays",
+    "StepLayout",
+    "TaskEnvs",
+    "TimeLimited",
+    "WorkerPool",
+]
+
+EnvFactory = Callable[[], "gym.Env[Any, Any]"]
+StartMethod = Literal["spawn", "fork", "forkserver"]
+
+START_TIMEOUT = 120.0
+"""Seconds that building the envs may take at least, whatever ``worker_timeout`` is."""
+
+REWARD_NORMALIZERS = ("NormalizeReward", "NormalizeRewardsExponential")
+"""Class names of the wrappers (Gymnasium's, Meta-World's) that hide the raw reward."""
+
+
+class EnvFacts(NamedTuple):
+    """What must be known of a built env before the arrays can be allocated."""
+
+    observation_space: gym.Space[Any]
+    action_space: gym.Space[Any]
+    goal_hidden: bool
+    reward_normalizer: str | None
+    max_episode_steps: int | None
+
+
+class Ended(NamedTuple):
+    """An episode's end: which env, its own info of the last step, and its info of the reset that followed."""
+
+    env: int
+    last_info: dict[str, Any]
+    reset_info: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class StepLayout:
+    """Sizes of the arrays that one step fills."""
+
+    n_envs: int
+    obs_dim: int
+    action_dim: int
+    action_dtype: str
+
+    def fields(self) -> list[tuple[str, str, tuple[int, ...]]]:
+        """Return (name, dtype, shape) of each array, in storage order."""
+        n = self.n_envs
+        return [
+            ("actions", self.action_dtype, (n, self.action_dim)),
+            ("obs", "float32", (n, self.obs_dim)),
+            ("terminal_obs", "float32", (n, self.obs_dim)),
+            ("rewards", "float32", (n,)),
+            ("terminated", "bool", (n,)),
+            ("truncated", "bool", (n,)),
+            ("success", "float32", (n,)),
+            ("success_once", "float32", (n,)),
+            ("episode_return", "float64", (n,)),
+            ("episode_length", "int64", (n,)),
+        ]
+
+    def offsets(self) -> list[int]:
+        """Return each array's first byte, 64-byte aligned, and the total size last."""
+        offsets = [0]
+        for _, dtype, shape in self.fields():
+            size = np.dtype(dtype).itemsize * int(np.prod(shape))
+            offsets.append(offsets[-1] + -(-size // 64) * 64)
+        return offsets
+
+
+class StepArrays:
+    """Views into one buffer: what goes into a step (``actions``) and what comes out of it.
+
+    ``obs``: ``(n_envs, obs_dim)``, the observation to act on next, so the new episode's first one after an
+    end.
+    ``terminal_obs``, ``episode_return`` (float64 sum of raw rewards), ``episode_length``, ``success_once``
+    (0, 1): valid in the rows that ended in this step. ``success``: this step's, NaN where the env reports
+    none.
+
+    :param layout: sizes
+    :param buffer: memory of at least ``layout.offsets()[-1]`` bytes; None allocates it in this process
+    """
+
+    actions: npt.NDArray[Any]
+    obs: npt.NDArray[np.float32]
+    terminal_obs: npt.NDArray[np.float32]
+    rewards: npt.NDArray[np.float32]
+    terminated: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+    success: npt.NDArray[np.float32]
+    success_once: npt.NDArray[np.float32]
+    episode_return: npt.NDArray[np.float64]
+    episode_length: npt.NDArray[np.int64]
+
+    def __init__(self, layout: StepLayout, buffer: bytearray | mmap.mmap | None = None) -> None:
+        offsets = layout.offsets()
+        memory = bytearray(offsets[-1]) if buffer is None else buffer
+        for (name, dtype, shape), offset in zip(layout.fields(), offsets, strict=False):
+            flat = np.frombuffer(memory, dtype, int(np.prod(shape)), offset)
+            setattr(self, name, flat.reshape(shape))
+
+    def rows(self, start: int, stop: int) -> StepArrays:
+        """Return the same memory, seen by the envs ``start`` to ``stop - 1`` only."""
+        part = object.__new__(StepArrays)
+        for name, array in vars(self).items():
+            setattr(part, name, array[start:stop])
+        return part
+
+
+class EnvRunner(Protocol):
+    """What `TaskEnvs` (in this process) and `WorkerPool` (in others) have in common."""
+
+    arrays: StepArrays
+
+    def build(self) -> list[EnvFacts]:
+        """Build the envs and return what they are."""
+
+    def allocate(self, layout: StepLayout) -> None:
+        """Allocate ``arrays``."""
+
+    def reset(
+        self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
+    ) -> list[dict[str, Any]]:
+        """Start a new episode in every env, first observations in ``arrays.obs``; return the infos."""
+
+    def step_async(self) -> None:
+        """Begin the step of ``arrays.actions``."""
+
+    def step_wait(self) -> list[Ended]:
+        """Finish it; the results are in ``arrays``."""
+
+    def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
+        """Return the answers of the named envs to a command of `TaskEnvs`."""
+
+    def close(self) -> None:
+        """Close the envs."""
+
+
+class TaskEnvs:
+    """Gymnasium envs stepped one after the other, with automatic reset and episode statistics.
+
+    :param factories: one per env
+    :param tasks: the task name of each env, for messages
+    """
+
+    arrays: StepArrays
+
+    def __init__(self, factories: Sequence[EnvFactory], tasks: Sequence[str]) -> None:
+        self._factories = factories
+        self._tasks = list(tasks)
+        self._envs: list[gym.Env[Any, Any]] = []
+        self._returns = [0.0] * len(tasks)
+        self._lengths = [0] * len(tasks)
+        self._once = [float("nan")] * len(tasks)
+        self.current = 0
+        """Index of the env that was touched last: the one to blame for an exception."""
+
+    def build(self) -> list[EnvFacts]:
+        """Build the envs and return what they are.
+
+        :raises ConfigError: if a factory raises or does not return a ``gymnasium.Env``
+        """
+        facts = []
+        for index, factory in enumerate(self._factories):
+            self.current = index
+            try:
+                env = factory()
+            except Exception as error:
+                raise ConfigError(
+                    f"The factory of task {self._tasks[self.current]!r} raised {type(error).__name__}: "
+                    f"{error}"
+                ) from error
+            if not isinstance(env, gym.Env):
+                raise ConfigError(
+                    f"The factory of task {self._tasks[self.current]!r} returned {type(env).__name__}, "
+                    "not a gymnasium.Env. Give a function that takes no argument and returns a new env."
+                )
+            self._envs.append(env)
+            facts.append(_facts(env))
+        return facts
+
+    def allocate(self, layout: StepLayout) -> None:
+        """Allocate the arrays in this process."""
+        self.arrays = StepArrays(layout)
+
+    def attach(self, path: str, layout: StepLayout, start: int, stop: int) -> None:
+        """Use rows ``start`` to ``stop - 1`` of the arrays that live in the file at ``path``."""
+        with open(path, "r+b") as file:
+            memory = mmap.mmap(file.fileno(), layout.offsets()[-1])
+        self.arrays = StepArrays(layout, memory).rows(start, stop)
+
+    def reset(
+        self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
+    ) -> list[dict[str, Any]]:
+        """Start a new episode in every env, first observations in ``arrays.obs``; return the infos.
+
+        :param seeds: one per env, None leaves the env's generator as it is
+        :param options: one per env, empty means none
+        """
+        infos = []
+        for index, (seed, option) in enumerate(zip(seeds, options, strict=True)):
+            infos.append(self._reset_env(index, seed, dict(option) or None))
+        self._check_finite(range(len(self._envs)), "reset")
+        return infos
+
+    def step_async(self) -> None:
+        """Do nothing: in this process a step runs in `step_wait`."""
+
+    def step_wait(self) -> list[Ended]:
+        """Step every env with its row of ``arrays.actions``; return the episodes that ended."""
+        arrays = self.arrays
+        ended: list[Ended] = []
+        for index, env in enumerate(self._envs):
+            self.current = index
+            # A copy, because the next step overwrites the row and an env may keep its last action.
+            obs, reward, terminated, truncated, info = env.step(arrays.actions[index].copy())
+            arrays.rewards[index] = reward
+            self._returns[index] += float(reward)
+            self._lengths[index] += 1
+            self._note_success(index, info)
+            arrays.terminated[index] = terminated
+            arrays.truncated[index] = truncated
+            if terminated or truncated:
+                ended.append(Ended(index, dict(info), self._end_episode(index, obs)))
+            else:
+                self._store(arrays.obs, index, obs, "step")
+        self._check_finite([end.env for end in ended], "step")
+        return ended
+
+    def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
+        """Return the answers of the envs at ``indices`` to a command: a method below, without underscore."""
+        answer = getattr(self, f"_{command}")
+        answers = []
+        for index in indices:
+            self.current = index
+            answers.append(answer(self._envs[index], *args))
+        return answers
+
+    def close(self) -> None:
+        """Close every env; an env that fails to close does not keep the others open."""
+        while self._envs:
+            with contextlib.suppress(Exception):
+                self._envs.pop().close()
+
+    def blame(self) -> str:
+        """Return the task of the env that was touched last."""
+        return self._tasks[self.current]
+
+    def _reset_env(self, index: int, seed: int | None, options: dict[str, Any] | None) -> dict[str, Any]:
+        self.current = index
+        obs, info = self._envs[index].reset(seed=seed, options=options)
+        self._returns[index], self._lengths[index], self._once[index] = 0.0, 0, float("nan")
+        self._store(self.arrays.obs, index, obs, "reset")
+        return dict(info)
+
+    def _end_episode(self, index: int, terminal_obs: Any) -> dict[str, Any]:
+        arrays = self.arrays
+        self._store(arrays.terminal_obs, index, terminal_obs, "step")
+        arrays.episode_return[index] = self._returns[index]
+        arrays.episode_length[index] = self._lengths[index]
+        arrays.success_once[index] = self._once[index]
+        return self._reset_env(index, None, None)
+
+    def _note_success(self, index: int, info: Mapping[str, Any]) -> None:
+        value = info.get("success", info.get("is_success"))
+        if value is None:
+            self.arrays.success[index] = np.nan
+            return
+        success = float(value)
+        self.arrays.success[index] = success
+        if success > 0.0:
+            self._once[index] = 1.0
+        elif self._once[index] != 1.0:
+            self._once[index] = 0.0
+
+    def _store(self, into: npt.NDArray[np.float32], index: int, obs: Any, where: str) -> None:
+        # Assignment would broadcast a scalar or a length of 1 without a word.
+        if np.shape(obs) != into.shape[1:]:
+            raise EnvContractError(
+                f"Task {self._tasks[index]!r}: {where}() returned an observation of shape {np.shape(obs)}, "
+                f"but its observation_space has shape {into.shape[1:]}. Make the env return what it declares."
+            )
+        into[index] = obs
+
+    def _check_finite(self, ended: Sequence[int], where: str) -> None:
+        arrays = self.arrays
+        finite = np.isfinite(arrays.obs).all(axis=1)
+        if where == "step":
+            finite &= np.isfinite(arrays.rewards)
+            for index in ended:
+                finite[index] &= np.isfinite(arrays.terminal_obs[index]).all()
+        if not finite.all():
+            bad = sorted({self._tasks[index] for index in np.flatnonzero(~finite)})
+            raise EnvContractError(
+                f"Task {', '.join(map(repr, bad))}: {where}() returned NaN or infinity in the observation "
+                "or the reward. One such number spoils the networks of all tasks; end the episode before "
+                "it arises."
+            )
+
+    @staticmethod
+    def _get_attr(env: gym.Env[Any, Any], name: str) -> Any:
+        return env.get_wrapper_attr(name)
+
+    @staticmethod
+    def _has_attr(env: gym.Env[Any, Any], name: str) -> bool:
+        return env.has_wrapper_attr(name)
+
+    @staticmethod
+    def _set_attr(env: gym.Env[Any, Any], name: str, value: Any) -> None:
+        env.set_wrapper_attr(name, value)
+
+    @staticmethod
+    def _env_method(env: gym.Env[Any, Any], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        return env.get_wrapper_attr(name)(*args, **kwargs)
+
+    @staticmethod
+    def _is_wrapped(env: gym.Env[Any, Any], wrapper_class: type[Any]) -> bool:
+        return any(
+            isinstance(layer, wrapper_class) for layer in _layers(env) if isinstance(layer, gym.Wrapper)
+        )
+
+    @staticmethod
+    def _render(env: gym.Env[Any, Any]) -> Any:
+        return env.render()
+
+
+class WorkerPool:
+    """The same as `TaskEnvs`, in ``n_workers`` processes that each own a contiguous run of the envs.
+
+    A dead, raising or hanging worker becomes a `WorkerError` that names its tasks, and ends all the others.
+
+    :param factories: one per env; they travel by cloudpickle, so lambdas and classes of a notebook will do
+    :param tasks: the task name of each env
+    :param n_workers: number of processes, 1 to the number of envs
+    :param start_method: "spawn", "fork" or "forkserver"
+    :param timeout: seconds a worker may take to answer, except for building its envs
+    """
+
+    arrays: StepArrays
+
+    def __init__(
+        self,
+        factories: Sequence[EnvFactory],
+        tasks: Sequence[str],
+        n_workers: int,
+        start_method: StartMethod = "spawn",
+        timeout: float = 30.0,
+    ) -> None:
+        self._tasks = list(tasks)
+        self._timeout = timeout
+        bounds = [len(tasks) * worker // n_workers for worker in range(n_workers + 1)]
+        self._chunks = [range(start, stop) for start, stop in itertools.pairwise(bounds)]
+        self._worker_of = [worker for worker, chunk in enumerate(self._chunks) for _ in chunk]
+        self._awaiting: set[int] = set()
+        self._replies: dict[int, bytes] = {}
+        self._processes: list[BaseProcess] = []
+        self._conns: list[Connection] = []
+        pickled = _pickle_factories(factories, tasks)
+        # Both a finalizer (the pool was dropped) and an exit handler (the script ended).
+        self._end = weakref.finalize(self, _end_workers, self._processes, self._conns, os.getpid())
+        try:
+            self._start(pickled, start_method)
+        except BaseException:
+            self.close()
+            raise
+
+    def build(self) -> list[EnvFacts]:
+        """Build the envs, each in its worker, and return what they are.
+
+        :raises ConfigError: as `TaskEnvs.build`; its cause holds the worker's traceback
+        """
+        self._send_all([("build", ())] * len(self._chunks))
+        self._collect(max(START_TIMEOUT, self._timeout), "building its envs")
+        return self._take_lists()
+
+    def allocate(self, layout: StepLayout) -> None:
+        """Allocate the arrays in a file in memory that every worker maps."""
+        # Not a multiprocessing.RawArray: that can be given to a process only when it starts, and the sizes
+        # are known only once the envs are built there. The file loses its name at once, so that nothing is
+        # left over.
+        shm = "/dev/shm"
+        folder = shm if os.access(shm, os.W_OK) else None
+        with tempfile.NamedTemporaryFile(prefix="sb3_ars_", dir=folder) as file:
+            file.truncate(layout.offsets()[-1])
+            self.arrays = StepArrays(layout, mmap.mmap(file.fileno(), layout.offsets()[-1]))
+            self._command(
+                [("attach", (file.name, layout, c.start, c.stop)) for c in self._chunks], "attaching memory"
+            )
+
+    def reset(
+        self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
+    ) -> list[dict[str, Any]]:
+        """Start a new episode in every env, first observations in ``arrays.obs``; return the infos."""
+        seeds, options = list(seeds), list(options)
+        parts = [(seeds[c.start : c.stop], options[c.start : c.stop]) for c in self._chunks]
+        self._command([("reset", part) for part in parts], "resetting its envs")
+        return self._take_lists()
+
+    def step_async(self) -> None:
+        """Begin the step of ``arrays.actions``: one byte to each worker."""
+        self._settle()
+        for worker in range(len(self._chunks)):
+            self._send(worker, _STEP)
+
+    def step_wait(self) -> list[Ended]:
+        """Wait for the step; return the episodes that ended, env indices over the whole pool."""
+        self._collect(self._timeout, "stepping its envs")
+        ended: list[Ended] = []
+        for worker, chunk in enumerate(self._chunks):
+            reply = self._replies.pop(worker)
+            if reply != _DONE:
+                ended += [end._replace(env=end.env + chunk.start) for end in pickle.loads(reply[1:])]
+        return ended
+
+    def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
+        """Return the answers of the named envs to a command of `TaskEnvs`; an env's exception is raised here.
+
+        The workers live on after it, as envs in this process would.
+        """
+        self._settle()
+        chunks = self._chunks
+        wanted = {w: [i for i in indices if i in chunks[w]] for w in {self._worker_of[i] for i in indices}}
+        for worker, chosen in wanted.items():
+            local = [index - chunks[worker].start for index in chosen]
+            self._send(worker, _COMMAND + _dumps(("call", (command, local, *args))))
+        self._collect(self._timeout, f"answering {command}", fatal=False)
+        answers: dict[int, Any] = {}
+        replies = {worker: self._replies.pop(worker) for worker in wanted}
+        for worker, chosen in wanted.items():
+            if replies[worker][:1] == _ERROR:
+                self._raise_original(replies[worker])
+            answers.update(zip(chosen, pickle.loads(replies[worker][1:]), strict=True))
+        return [answers[index] for index in indices]
+
+    def close(self) -> None:
+        """End the workers, gently at first; never hangs, may be called twice."""
+        self._end()
+
+    @property
+    def pids(self) -> list[int]:
+        """Return the process ids of the workers that have not been ended."""
+        return [process.pid for process in self._processes if process.pid is not None]
+
+    def _start(self, factories: Sequence[EnvFactory], start_method: StartMethod) -> None:
+        context: Any = multiprocessing.get_context(start_method)
+        with _hidden_main(), _single_threaded():
+            for number, chunk in enumerate(self._chunks):
+                ours, theirs = context.Pipe()
+                # A forked child holds copies of the pipes before it and would keep them open after the parent
+                # died.
+                stale = [*self._conns, ours] if start_method == "fork" else []
+                self._conns.append(ours)
+                envs = TaskEnvs(factories[chunk.start : chunk.stop], self._tasks[chunk.start : chunk.stop])
+                process = context.Process(
+                    target=_work, args=(theirs, stale, envs), name=f"sb3_ars-envs-{number}", daemon=True
+                )
+                process.start()
+                self._processes.append(process)
+                # Else a dead worker's pipe would never reach its end here.
+                theirs.close()
+
+    def _command(self, messages: Sequence[tuple[str, tuple[Any, ...]]], doing: str) -> None:
+        self._send_all(messages)
+        self._collect(self._timeout, doing)
+
+    def _send_all(self, messages: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
+        self._settle()
+        for worker, message in enumerate(messages):
+            self._send(worker, _COMMAND + _dumps(message))
+
+    def _settle(self) -> None:
+        """Throw away answers of a command that was interrupted (Ctrl-C) between sending and receiving."""
+        if self._awaiting:
+            self._collect(self._timeout, "finishing an interrupted command", fatal=False)
+        self._replies.clear()
+
+    def _send(self, worker: int, message: bytes) -> None:
+        try:
+            self._conns[worker].send_bytes(message)
+        except OSError:
+            self._fail_dead(worker, "before it could be asked")
+        self._awaiting.add(worker)
+
+    def _collect(self, timeout: float, doing: str, fatal: bool = True) -> None:
+        deadline = time.monotonic() + timeout
+        while self._awaiting:
+            sources: dict[Any, int] = {self._conns[worker]: worker for worker in self._awaiting}
+            sources.update({self._processes[worker].sentinel: worker for worker in self._awaiting})
+            ready = connection.wait(list(sources), max(0.0, deadline - time.monotonic()))
+            if not ready:
+                self._fail_hung(timeout, doing)
+            for worker in {sources[source] for source in ready}:
+                self._receive(worker, doing, fatal)
+
+    def _receive(self, worker: int, doing: str, fatal: bool) -> None:
+        conn = self._conns[worker]
+        try:
+            reply = conn.recv_bytes() if conn.poll() else None
+        except (EOFError, OSError):
+            reply = None
+        if reply is None:
+            self._fail_dead(worker, f"while {doing}")
+        self._awaiting.discard(worker)
+        self._replies[worker] = reply
+        if fatal and reply[:1] == _ERROR:
+            self._fail_raised(reply, doing)
+
+    def _take_lists(self) -> list[Any]:
+        parts = [pickle.loads(self._replies.pop(worker)[1:]) for worker in range(len(self._chunks))]
+        return [item for part in parts for item in part]
+
+    def _name(self, worker: int) -> str:
+        chunk = self._chunks[worker]
+        tasks = dict.fromkeys(self._tasks[chunk.start : chunk.stop])
+        return f"Env worker {worker} (task{'s' * (len(tasks) > 1)} {', '.join(map(repr, tasks))})"
+
+    def _fail_dead(self, worker: int, when: str) -> NoReturn:
+        process = self._processes[worker]
+        process.join(1.0)
+        code = process.exitcode
+        how = (
+            f"was killed by {signal.Signals(-code).name}"
+            if code is not None and code < 0
+            else f"exited with {code}"
+        )
+        hint = (
+            " Out of memory is the usual reason for SIGKILL: use fewer envs or workers." if code == -9 else ""
+        )
+        self._fail(
+            f"{self._name(worker)} {how} {when}.{hint} Its last words, if any, are on the error output."
+        )
+
+    def _fail_hung(self, timeout: float, doing: str) -> NoReturn:
+        names = "; ".join(self._name(worker) for worker in sorted(self._awaiting))
+        self._fail(
+            f"{names} did not answer within {timeout:g} s while {doing}. "
+            "If the env is only slow, raise worker_timeout; if it hangs, try n_workers=0 to see where."
+        )
+
+    def _fail_raised(self, reply: bytes, doing: str) -> NoReturn:
+        task, trace, error = _read_error(reply)
+        self.close()
+        if isinstance(error, ConfigError | EnvContractError):
+            raise error from WorkerError(f"in the worker:\n\n{trace}")
+        raise WorkerError(
+            f"The env of task {task!r} raised an exception while {doing}. All env workers were ended. "
+            f"The worker's traceback:\n\n{trace}"
+        ) from error
+
+    def _raise_original(self, reply: bytes) -> NoReturn:
+        task, trace, error = _read_error(reply)
+        reason = WorkerError(f"The env of task {task!r} raised, in its worker:\n\n{trace}")
+        if error is None:
+            raise reason
+        raise error from reason
+
+    def _fail(self, message: str) -> NoReturn:
+        # Ended without asking: one of them is known not to answer.
+        _end_workers(self._processes, self._conns, os.getpid(), grace=0.0)
+        raise WorkerError(f"{message} All env workers were ended; build the env again.")
+
+
+class TimeLimited:
+    """A factory whose envs are truncated after ``max_episode_steps``; here, so that workers load no SB3.
+
+    :param factory: makes the env inside
+    :param max_episode_steps: the horizon
+    """
+
+    def __init__(self, factory: EnvFactory, max_episode_steps: int) -> None:
+        self.factory = factory
+        self.max_episode_steps = max_episode_steps
+
+    def __call__(self) -> gym.Env[Any, Any]:
+        """Return a new env."""
+        return gym.wrappers.TimeLimit(self.factory(), self.max_episode_steps)
+
+
+_STEP, _COMMAND, _CLOSE = b"s", b"c", b"q"
+_DONE, _RESULT, _ERROR = b"d", b"r", b"e"
+
+
+class _PickledFactory:
+    """A factory as cloudpickle's bytes: nothing of it is loaded until it is called, in the worker."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def __call__(self) -> gym.Env[Any, Any]:
+        """Return a new env."""
+        env: gym.Env[Any, Any] = pickle.loads(self.data)()
+        return env
+
+
+def _pickle_factories(factories: Sequence[EnvFactory], tasks: Sequence[str]) -> list[_PickledFactory]:
+    pickled = []
+    for factory, task in zip(factories, tasks, strict=True):
+        try:
+            pickled.append(_PickledFactory(_dumps(factory)))
+        except Exception as error:
+            raise ConfigError(
+                f"The factory of task {task!r} cannot be sent to a worker process ({error}). Build "
+                "everything the env needs inside the factory, or use n_workers=0."
+            ) from error
+    return pickled
+
+
+def _dumps(value: Any) -> bytes:
+    data: bytes = cloudpickle.dumps(value)
+    return data
+
+
+def _facts(env: gym.Env[Any, Any]) -> EnvFacts:
+    normalizers = [
+        type(layer).__name__ for layer in _layers(env) if type(layer).__name__ in REWARD_NORMALIZERS
+    ]
+    return EnvFacts(
+        env.observation_space,
+        env.action_space,
+        _goal_hidden(env),
+        normalizers[0] if normalizers else None,
+        _max_episode_steps(env),
+    )
+
+
+def _goal_hidden(env: gym.Env[Any, Any]) -> bool:
+    inner = env.unwrapped
+    if getattr(inner, "_partially_observable", False) is not True:
+        return False
+    # Meta-World's own stacks decide in their first reset; before it each env says that its goal is hidden.
+    try:
+        env.reset()
+    except Exception:
+        return True
+    return getattr(inner, "_partially_observable", False) is True
+
+
+def _max_episode_steps(env: gym.Env[Any, Any]) -> int | None:
+    for name in ("_max_episode_steps", "max_episode_steps"):
+        if env.has_wrapper_attr(name):
+            value = env.get_wrapper_attr(name)
+            return int(value) if isinstance(value, int | np.integer) else None
+    return env.spec.max_episode_steps if env.spec is not None else None
+
+
+def _layers(env: gym.Env[Any, Any]) -> Iterator[gym.Env[Any, Any]]:
+    yield env
+    while isinstance(env, gym.Wrapper):
+        env = env.env
+        yield env
+
+
+def _work(conn: Connection, stale: Sequence[Connection], envs: TaskEnvs) -> None:
+    """Serve one chunk of envs until told to stop or until the parent is gone."""
+    # Ctrl-C reaches the whole process group; the parent decides what happens then.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for other in stale:
+        other.close()
+    torch = sys.modules.get("torch")  # present only in a forked worker, with the parent's number of threads
+    if torch is not None:
+        torch.set_num_threads(1)
+    # A pipe at its end or broken means that the parent is gone: nobody is left to tell.
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while (message := conn.recv_bytes()) != _CLOSE:
+            conn.send_bytes(_answer(envs, message))
+    envs.close()
+
+
+def _answer(envs: TaskEnvs, message: bytes) -> bytes:
+    try:
+        if message == _STEP:
+            ended = envs.step_wait()
+            return _RESULT + _dumps(ended) if ended else _DONE
+        method, args = pickle.loads(message[1:])
+        return _RESULT + _dumps(getattr(envs, method)(*args))
+    except Exception as error:
+        return _ERROR + _dumps((envs.blame(), traceback.format_exc(), _portable(error)))
+
+
+def _portable(error: Exception) -> bytes | None:
+    """Return the exception pickled, or None if it does not survive the journey."""
+    try:
+        data = _dumps(error)
+        pickle.loads(data)
+    except Exception:
+        return None
+    return data
+
+
+def _read_error(reply: bytes) -> tuple[str, str, Exception | None]:
+    task, trace, data = pickle.loads(reply[1:])
+    try:
+        return task, trace, None if data is None else pickle.loads(data)
+    except Exception:
+        return task, trace, None
+
+
+def _end_workers(
+    processes: list[BaseProcess], conns: list[Connection], owner: int, grace: float = 3.0
+) -> None:
+    if os.getpid() != owner:  # a forked copy of the parent must not end the parent's workers
+        return
+    for conn in conns:
+        with contextlib.suppress(OSError):
+            conn.send_bytes(_CLOSE)
+        conn.close()
+    _join(processes, grace)
+    for process in processes:
+        process.terminate()
+    _join(processes, 1.0)
+    for process in processes:
+        process.kill()
+    _join(processes, 1.0)
+    processes.clear()
+    conns.clear()
+
+
+def _join(processes: Sequence[BaseProcess], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    for process in processes:
+        process.join(max(0.0, deadline - time.monotonic()))
+
+
+@contextlib.contextmanager
+def _hidden_main() -> Iterator[None]:
+    """Hide where ``__main__`` came from while processes start.
+
+    multiprocessing makes each spawned child run the parent's main script again, to find what it defines; a
+    script without ``if __name__ == "__main__"`` would then start workers in its workers. We need nothing from
+    there, since cloudpickle carries what ``__main__`` defines by value.
+    """
+    main = sys.modules["__main__"]
+    missing = object()
+    kept = {name: getattr(main, name, missing) for name in ("__file__", "__spec__")}
+    try:
+        main.__spec__ = None
+        if kept["__file__"] is not missing:
+            del main.__file__
+        yield
+    finally:
+        for name, value in kept.items():
+            if value is not missing:
+                setattr(main, name, value)
+
+
+@contextlib.contextmanager
+def _single_threaded() -> Iterator[None]:
+    """Let processes started meanwhile use one thread per numeric library: each worker has one core.
+
+    Through the environment, because these libraries read it once, when they load.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+    kept = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in kept.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

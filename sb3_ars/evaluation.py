@@ -1,0 +1,267 @@
+"""Evaluate a policy task by task under a named protocol; knows models only through ``predict``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, unwrap_vec_normalize
+from tqdm.auto import tqdm
+
+from sb3_ars.envs import make_metaworld_env
+from sb3_ars.envs.metaworld import Goals
+from sb3_ars.errors import ConfigError, nearest
+
+__all__ = [
+    "PROTOCOLS",
+    "EvaluationProtocol",
+    "TaskEvaluation",
+    "evaluate_tasks",
+    "get_protocol",
+    "make_evaluation_env",
+]
+
+Array = npt.NDArray[np.float64]
+
+
+class Policy(Protocol):
+    """Anything with SB3's ``predict``."""
+
+    def predict(self, observation: Any, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
+        """Return actions for a batch of observations."""
+
+
+@dataclass(frozen=True)
+class EvaluationProtocol:
+    """What makes two success rates comparable.
+
+    :param name: how reports call it
+    :param n_episodes: episodes per task
+    :param max_episode_steps: horizon in steps; ``None`` leaves the environment's own
+    :param goals: "ordered" goes through the stored goals one by one, so each episode has another goal; ``None`` where
+        the tasks are not Meta-World's
+    """
+
+    name: str
+    n_episodes: int = 10
+    max_episode_steps: int | None = 500
+    goals: Goals | None = "ordered"
+
+    def describe(self) -> str:
+        """Return the protocol in one line, to stand beside every number."""
+        horizon = (
+            "the env's horizon" if self.max_episode_steps is None else f"horizon {self.max_episode_steps}"
+        )
+        goals = "" if self.goals is None else f", {self.goals} goals"
+        return f"protocol {self.name}: {self.n_episodes} episodes per task, {horizon}{goals}"
+
+
+PROTOCOLS = {
+    "paper": EvaluationProtocol("paper", n_episodes=10, max_episode_steps=500),
+    "metaworld": EvaluationProtocol("metaworld", n_episodes=50, max_episode_steps=500),
+    "h150": EvaluationProtocol("h150", n_episodes=10, max_episode_steps=150),
+}
+"""``paper``: ARS, section 5; ``metaworld``: Meta-World+'s 50 goals; ``h150``: ARS, appendix E.4."""
+
+
+@dataclass(frozen=True)
+class TaskEvaluation:
+    """Episodes of one policy on every task, arrays of shape ``(n_tasks, n_episodes)``.
+
+    ``success_once``: success at any step; ``success_at_end``: at the last step; both NaN where a task reports none.
+    """
+
+    protocol: EvaluationProtocol
+    task_names: tuple[str, ...]
+    deterministic: bool
+    success_once: Array
+    success_at_end: Array
+    returns: Array
+    lengths: Array
+
+    @property
+    def success(self) -> Array:
+        """``(n_tasks,)`` success rates, at least once, in [0, 1]."""
+        rates: Array = self.success_once.mean(axis=1)
+        return rates
+
+    @property
+    def mean_success(self) -> float:
+        """Mean over tasks of the success rates."""
+        return float(self.success.mean())
+
+    def table(self) -> pd.DataFrame:
+        """Return one row per task: success, success at the end, return, length."""
+        return pd.DataFrame(
+            {
+                "success": self.success,
+                "success_at_end": self.success_at_end.mean(axis=1),
+                "return": self.returns.mean(axis=1),
+                "length": self.lengths.mean(axis=1),
+            },
+            index=pd.Index(self.task_names, name="task"),
+        )
+
+
+def get_protocol(protocol: str | EvaluationProtocol) -> EvaluationProtocol:
+    """Return the protocol of that name, or the one given.
+
+    :raises ConfigError: if the name is unknown, or the number of episodes is not positive
+    """
+    if isinstance(protocol, str):
+        if protocol not in PROTOCOLS:
+            raise ConfigError(
+                f"Unknown evaluation protocol {protocol!r}; choose one of {sorted(PROTOCOLS)}."
+                + nearest(protocol, PROTOCOLS)
+            )
+        return PROTOCOLS[protocol]
+    if protocol.n_episodes < 1:
+        raise ConfigError(
+            f"protocol {protocol.name!r} has n_episodes={protocol.n_episodes}; it must be at least 1."
+        )
+    return protocol
+
+
+def make_evaluation_env(
+    tasks: str | Sequence[str], protocol: str | EvaluationProtocol = "paper", **kwargs: Any
+) -> VecEnv:
+    """Return Meta-World environments as the protocol wants them: its horizon, its goals.
+
+    :param tasks: what ``make_metaworld_env`` takes
+    :param protocol: name or protocol
+    :param kwargs: further arguments of ``make_metaworld_env``
+    """
+    chosen = get_protocol(protocol)
+    return make_metaworld_env(
+        tasks,
+        goals=chosen.goals or "ordered",
+        n_goals=max(chosen.n_episodes, kwargs.get("n_envs_per_task", 1)),
+        max_episode_steps=chosen.max_episode_steps or 500,
+        **{"seed": 0, **kwargs},
+    )
+
+
+def evaluate_tasks(
+    model: Policy,
+    env: VecEnv | str | Sequence[str],
+    protocol: str | EvaluationProtocol = "paper",
+    deterministic: bool = True,
+    seed: int = 0,
+    progress_bar: bool = False,
+) -> TaskEvaluation:
+    """Run the protocol's episodes on every task and return their outcomes.
+
+    Neither the training environment nor the global torch generator is touched.
+
+    :param model: a trained model
+    :param env: a multi-task environment made for evaluation, or what ``make_metaworld_env`` takes
+    :param protocol: name or protocol
+    :param deterministic: mean actions, or samples
+    :param seed: of the sampled actions and of the environment's first reset
+    :param progress_bar: whether to show one
+    :raises ConfigError: if the environment is the model's own, has no tasks, other tasks than the model, or another
+        horizon than the protocol
+    """
+    chosen = get_protocol(protocol)
+    if isinstance(env, VecEnv):
+        return _evaluate(model, env, chosen, deterministic, seed, progress_bar)
+    with closing(make_evaluation_env(env, chosen)) as own:
+        return _evaluate(model, own, chosen, deterministic, seed, progress_bar)
+
+
+def _evaluate(
+    model: Policy,
+    env: VecEnv,
+    protocol: EvaluationProtocol,
+    deterministic: bool,
+    seed: int,
+    progress_bar: bool,
+) -> TaskEvaluation:
+    task_names, task_of_env = _check_env(model, env, protocol)
+    wanted = _episodes_of_env(task_of_env, len(task_names), protocol.n_episodes)
+    episodes: list[list[dict[str, float]]] = [[] for _ in range(env.num_envs)]
+    env.seed(seed)
+    obs = env.reset()
+    with (
+        th.random.fork_rng(),
+        tqdm(total=int(wanted.sum()), desc="evaluating", unit="episode", disable=not progress_bar) as bar,
+    ):
+        th.manual_seed(seed)
+        while any(len(done) < n for done, n in zip(episodes, wanted, strict=True)):
+            actions, _ = model.predict(obs, deterministic=deterministic)
+            obs, _, dones, infos = env.step(actions)
+            for index in np.flatnonzero(dones):
+                if len(episodes[index]) < wanted[index]:
+                    episodes[index].append(_outcome(infos[index]))
+                    bar.update()
+    by_task = [
+        [e for index in np.flatnonzero(task_of_env == task) for e in episodes[index]]
+        for task in range(len(task_names))
+    ]
+    columns = {key: np.array([[e[key] for e in task] for task in by_task]) for key in _OUTCOMES}
+    return TaskEvaluation(protocol, tuple(task_names), deterministic, **columns)
+
+
+_OUTCOMES = ("success_once", "success_at_end", "returns", "lengths")
+
+
+def _outcome(info: dict[str, Any]) -> dict[str, float]:
+    return {
+        "success_once": float(info.get("is_success", np.nan)),
+        "success_at_end": float(info.get("success_at_end", np.nan)),
+        "returns": float(info["episode"]["r"]),
+        "lengths": float(info["episode"]["l"]),
+    }
+
+
+def _check_env(
+    model: Policy, env: VecEnv, protocol: EvaluationProtocol
+) -> tuple[list[str], npt.NDArray[np.int64]]:
+    training_env: Any = getattr(model, "env", None)
+    if training_env is not None and env.unwrapped is training_env.unwrapped:
+        raise ConfigError(
+            "Evaluation would tear the running episodes of the model's training environment; make a separate one, or "
+            "pass the task list and let evaluate_tasks make it."
+        )
+    if not hasattr(env, "task_names"):
+        raise ConfigError(
+            "The evaluation environment has no tasks; make it with make_metaworld_env or make_multitask_env."
+        )
+    tasks: Any = env  # SB3's VecEnv, or a wrapper of it, with our attributes
+    names = list(tasks.task_names)
+    trained_on = getattr(model, "task_names", None)
+    if trained_on is not None and list(trained_on) != names:
+        raise ConfigError(
+            f"The model was trained on {list(trained_on)}, but the evaluation environment has {names}."
+        )
+    horizon = getattr(env, "max_episode_steps", None)
+    if protocol.max_episode_steps is not None and horizon not in (None, protocol.max_episode_steps):
+        raise ConfigError(
+            f"{protocol.describe()}, but the environment's max_episode_steps is {horizon}. Make it with "
+            f"max_episode_steps={protocol.max_episode_steps}, or evaluate under "
+            f"EvaluationProtocol(name, max_episode_steps=None)."
+        )
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is not None:
+        normalizer.training = False
+        if training_env is not None:
+            sync_envs_normalization(training_env, env)
+    return names, np.asarray(tasks.task_of_env)
+
+
+def _episodes_of_env(
+    task_of_env: npt.NDArray[np.int64], n_tasks: int, n_episodes: int
+) -> npt.NDArray[np.int64]:
+    """Share each task's episodes among its environments beforehand: taking the first to end would favour short ones."""
+    wanted = np.zeros(len(task_of_env), dtype=np.int64)
+    for task in range(n_tasks):
+        envs = np.flatnonzero(task_of_env == task)
+        wanted[envs] = n_episodes // len(envs)
+        wanted[envs[: n_episodes % len(envs)]] += 1
+    return wanted

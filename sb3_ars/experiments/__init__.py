@@ -1,0 +1,1 @@
+"""Runs as data: presets, the runner, figures."""

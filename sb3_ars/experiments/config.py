@@ -1,0 +1,211 @@
+"""What a run is: nested frozen dataclasses that presets (YAML) and the command line both build; runs nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_type_hints
+
+import yaml
+
+from sb3_ars.config import ARSConfig
+from sb3_ars.errors import ConfigError, nearest
+
+__all__ = [
+    "AlgorithmConfig",
+    "EnvConfig",
+    "EvaluationConfig",
+    "PolicyConfig",
+    "RunConfig",
+    "load_config",
+    "load_preset",
+    "preset_names",
+    "save_config",
+]
+
+Activation = Literal["relu", "tanh"]
+Config = TypeVar("Config")
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The training environments."""
+
+    tasks: str | tuple[str, ...] = "MT10"
+    """Meta-World benchmark ("MT10", "MT25", "MT50"), task names, or "toy"."""
+    n_envs_per_task: int = 1
+    """Environments of each task that step together."""
+    goals: Literal["random", "stored"] = "random"
+    """Goals drawn anew each episode, or one of 50 stored ones."""
+    max_episode_steps: int = 500
+    """Horizon in steps."""
+    n_workers: int | Literal["auto"] = "auto"
+    """Worker processes; 0 steps in this process."""
+
+
+@dataclass(frozen=True)
+class AlgorithmConfig:
+    """SB3's options, and where they differ ours."""
+
+    algorithm: Literal["ARSSAC", "ARSTQC"] = "ARSSAC"
+    """Soft actor-critic, or truncated quantile critics."""
+    total_timesteps: int = 20_000_000
+    """Length of the run in environment steps, summed over tasks."""
+    learning_rate: float = 3e-4
+    """Step size of Adam for actor, critics and temperatures."""
+    buffer_size: int = 1_000_000
+    """Transitions per task."""
+    batch_size: int = 100
+    """Rows per task in each update."""
+    learning_starts: int | Literal["auto"] = "auto"
+    """Environment steps before the first update; auto is 1.25 % of the run and at least one batch per task."""
+    gradient_steps: int = 1
+    """Updates after each joint step of all environments."""
+    gamma: float = 0.99
+    """Discount."""
+    tau: float = 0.005
+    """Weight of the new critics in the target critics, per update."""
+    device: str = "auto"
+    """Where networks and buffers live: auto, cpu or cuda."""
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """The networks."""
+
+    net_arch: tuple[int, ...] = (400, 400, 400, 400)
+    """Widths of the hidden layers of actor and critics."""
+    actor_activation: Activation = "relu"
+    """Activation of the actor's hidden layers."""
+    critic_activation: Activation = "tanh"
+    """Activation of the critics' hidden layers."""
+    critic_layer_norm: bool = False
+    """LayerNorm on the input and hidden layers of the critics (ARS-LN)."""
+    std: Literal["exp", "softplus"] = "exp"
+    """How the policy's standard deviation is parametrised."""
+    weight_init: Literal["torch", "xavier"] = "torch"
+    """Initial weights."""
+    fused_optimizer: bool = True
+    """One kernel for all of Adam; faster, and equal up to rounding."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Evaluation during and after training, on environments of its own."""
+
+    protocol: str = "paper"
+    """Named protocol: paper, metaworld or h150."""
+    n_episodes: int | None = None
+    """Episodes per task, instead of the protocol's."""
+    every: int | None = None
+    """Environment steps between evaluations during training; None evaluates at the end only."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One training run."""
+
+    seed: int = 0
+    """Seed of everything random."""
+    output: Path = Path("runs")
+    """Folder in which the run makes its own folder."""
+    log_interval: int = 10
+    """Episodes between two rows of progress.csv."""
+    verbose: int = 0
+    """1 also prints SB3's log table."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    algorithm: AlgorithmConfig = field(default_factory=AlgorithmConfig)
+    ars: ARSConfig = field(default_factory=ARSConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+def preset_names() -> list[str]:
+    """Return the names of the presets that ship with the package."""
+    return sorted(
+        path.name.removesuffix(".yaml") for path in _presets().iterdir() if path.name.endswith(".yaml")
+    )
+
+
+def load_preset(name: str) -> RunConfig:
+    """Return the configuration of a preset.
+
+    :param name: one of :func:`preset_names`
+    :raises ConfigError: if there is none of that name, or its file holds an unknown key
+    """
+    return _build(RunConfig, _preset_values(name), f"preset {name!r}")
+
+
+def load_config(path: Path) -> RunConfig:
+    """Return the configuration a run wrote.
+
+    :param path: its ``config.yaml``
+    :raises ConfigError: if the file is missing, is no mapping, or holds an unknown key
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path} does not exist; give the folder of a run, which holds config.yaml.")
+    values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{path} is not the configuration of a run.")
+    return _build(RunConfig, values, str(path))
+
+
+def save_config(config: RunConfig, path: Path) -> None:
+    """Write the effective configuration as YAML.
+
+    :param config: of the run
+    :param path: file to write
+    """
+    path.write_text(yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False), encoding="utf-8")
+
+
+def _presets() -> Any:
+    return resources.files("sb3_ars.experiments") / "presets"
+
+
+def _preset_values(name: str) -> dict[str, Any]:
+    names = preset_names()
+    if name not in names:
+        raise ConfigError(
+            f"There is no preset {name!r}; there are {', '.join(names)}." + nearest(name, names)
+        )
+    values: dict[str, Any] = yaml.safe_load((_presets() / f"{name}.yaml").read_text(encoding="utf-8"))
+    base = values.pop("extends", None)
+    return values if base is None else _merged(_preset_values(base), values)
+
+
+def _merged(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        merged[key] = _merged(base[key], value) if isinstance(base.get(key), dict) else value
+    return merged
+
+
+def _build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
+    """Make a nested dataclass of plain values; an unknown key is an error."""
+    hints = get_type_hints(cls)
+    kwargs = {}
+    for key, value in values.items():
+        if key not in hints:
+            raise ConfigError(
+                f"{where}: {key!r} is no option of {cls.__name__}; it has {', '.join(hints)}."
+                + nearest(str(key), hints)
+            )
+        if dataclasses.is_dataclass(hints[key]):
+            kwargs[key] = _build(hints[key], value or {}, where)
+        elif hints[key] is Path:
+            kwargs[key] = Path(value)
+        else:
+            kwargs[key] = tuple(value) if isinstance(value, list) else value
+    return cls(**kwargs)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value

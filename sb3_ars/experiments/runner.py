@@ -1,0 +1,322 @@
+"""Turns a configuration into a finished run folder: config, versions, log, policy, tables, figure."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import platform
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import psutil
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+
+from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
+from sb3_ars.algorithms.sac import ARSSAC
+from sb3_ars.algorithms.tqc import ARSTQC
+from sb3_ars.callbacks.evaluation import TaskEvalCallback
+from sb3_ars.envs import make_metaworld_env, make_toy_env
+from sb3_ars.errors import ConfigError
+from sb3_ars.evaluation import (
+    EvaluationProtocol,
+    TaskEvaluation,
+    evaluate_tasks,
+    get_protocol,
+    make_evaluation_env,
+)
+from sb3_ars.experiments.config import Activation, RunConfig, load_config, save_config
+from sb3_ars.experiments.plots import plot_training
+
+__all__ = ["RunResult", "build_model", "evaluate_run", "final_table", "make_env", "run_versions", "train"]
+
+_ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
+_ALGORITHMS: dict[str, type[MultiTaskOffPolicyAlgorithm]] = {"ARSSAC": ARSSAC, "ARSTQC": ARSTQC}
+_VERSIONS_OF = (
+    "sb3-ars",
+    "stable-baselines3",
+    "sb3-contrib",
+    "torch",
+    "gymnasium",
+    "metaworld",
+    "mujoco",
+    "numpy",
+)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run leaves behind.
+
+    :param folder: of the run
+    :param table: one row per task: success, success_sampled, return, c_i; the final evaluation
+    :param protocol: the final evaluation's protocol in one line
+    :param seconds: training time
+    """
+
+    folder: Path
+    table: pd.DataFrame
+    protocol: str
+    seconds: float
+
+
+def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
+    """Train as configured, evaluate, and write the run's folder.
+
+    An interrupt (Ctrl-C) ends training early; what was learned is evaluated and saved like a finished run.
+
+    :param config: of the run
+    :param name: of the preset, for the folder's name
+    :param progress_bar: whether to show one
+    :raises ConfigError: before training, if an option cannot work or the folder cannot be written
+    """
+    protocol = protocol_of(config)
+    folder = _make_folder(config, name)
+    save_config(config, folder / "config.yaml")
+    _write_json(folder / "versions.json", run_versions())
+    with closing(make_env(config)) as env:
+        model = build_model(config, env)
+        outputs = ["csv", "tensorboard", *(["stdout"] if config.verbose else [])]
+        model.set_logger(configure(str(folder), outputs))
+        started = time.monotonic()
+        with closing(_make_evaluation_env(config, protocol)) as evaluation_env:
+            interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar)
+            seconds = time.monotonic() - started
+            model.save(folder / "policy")
+            evaluations = _evaluate_both(model, evaluation_env, protocol, progress_bar)
+    table = final_table(evaluations, model.reward_scale.scale.tolist())
+    _write_result(folder, table, protocol, model, seconds, interrupted)
+    plot_training(
+        folder / "progress.csv", list(env_names(model)), model.reward_scale_history, folder / "training.png"
+    )
+    return RunResult(folder, table, protocol.describe(), seconds)
+
+
+def evaluate_run(
+    folder: Path, protocol: str | None = None, n_episodes: int | None = None, progress_bar: bool = True
+) -> RunResult:
+    """Evaluate a finished run's policy again, and write the table beside it.
+
+    :param folder: of the run
+    :param protocol: name; ``None`` is the run's own
+    :param n_episodes: episodes per task, instead of the protocol's
+    :param progress_bar: whether to show one
+    :raises ConfigError: if the folder holds no run
+    """
+    config = load_config(folder / "config.yaml")
+    evaluation = dataclasses.replace(
+        config.evaluation,
+        protocol=protocol or config.evaluation.protocol,
+        n_episodes=n_episodes or (None if protocol else config.evaluation.n_episodes),
+    )
+    config = dataclasses.replace(config, evaluation=evaluation)
+    chosen = protocol_of(config, own_horizon=protocol is None)
+    if not (folder / "policy.zip").is_file():
+        raise ConfigError(f"{folder} holds no policy.zip; the run did not finish.")
+    model = _ALGORITHMS[config.algorithm.algorithm].load(
+        folder / "policy.zip", device=config.algorithm.device
+    )
+    started = time.monotonic()
+    with closing(_make_evaluation_env(config, chosen)) as env:
+        evaluations = _evaluate_both(model, env, chosen, progress_bar)
+    table = final_table(evaluations, model.reward_scale.scale.tolist())
+    table.to_csv(folder / f"evaluation-{chosen.name}.csv")
+    return RunResult(folder, table, chosen.describe(), time.monotonic() - started)
+
+
+def make_env(config: RunConfig) -> VecEnv:
+    """Return the training environments of a configuration."""
+    env = config.env
+    common: dict[str, Any] = {
+        "seed": config.seed,
+        "n_envs_per_task": env.n_envs_per_task,
+        "max_episode_steps": env.max_episode_steps,
+        "n_workers": env.n_workers,
+    }
+    if env.tasks == "toy":
+        return make_toy_env(**common)
+    return make_metaworld_env(_task_list(env.tasks), goals=env.goals, **common)
+
+
+def build_model(config: RunConfig, env: VecEnv) -> MultiTaskOffPolicyAlgorithm:
+    """Return the untrained model of a configuration."""
+    options = dataclasses.asdict(config.algorithm)
+    algorithm = _ALGORITHMS[options.pop("algorithm")]
+    del options["total_timesteps"]
+    policy = config.policy
+    return algorithm(
+        "MlpPolicy",
+        env,
+        policy_kwargs={
+            "net_arch": list(policy.net_arch),
+            "activation_fn": _ACTIVATIONS[policy.actor_activation],
+            "critic_activation_fn": _ACTIVATIONS[policy.critic_activation],
+            "critic_layer_norm": policy.critic_layer_norm,
+            "std": policy.std,
+            "weight_init": policy.weight_init,
+            "optimizer_kwargs": {"fused": policy.fused_optimizer},
+        },
+        seed=config.seed,
+        verbose=config.verbose,
+        **options,
+        **{f.name: getattr(config.ars, f.name) for f in dataclasses.fields(config.ars)},
+    )
+
+
+def protocol_of(config: RunConfig, own_horizon: bool = True) -> EvaluationProtocol:
+    """Return the evaluation protocol of a configuration.
+
+    :param own_horizon: take the training horizon where it differs from the protocol's, and say so in the name
+    """
+    protocol = get_protocol(config.evaluation.protocol)
+    n_episodes = config.evaluation.n_episodes or protocol.n_episodes
+    if config.env.tasks == "toy":
+        return EvaluationProtocol("toy", n_episodes, config.env.max_episode_steps, goals=None)
+    horizon = config.env.max_episode_steps if own_horizon else protocol.max_episode_steps
+    changed = (n_episodes, horizon) != (protocol.n_episodes, protocol.max_episode_steps)
+    name = f"{protocol.name}-adapted" if changed else protocol.name
+    return dataclasses.replace(protocol, name=name, n_episodes=n_episodes, max_episode_steps=horizon)
+
+
+def final_table(evaluations: dict[bool, TaskEvaluation], reward_scale: list[float]) -> pd.DataFrame:
+    """Return one row per task from the deterministic and the sampled evaluation.
+
+    :param evaluations: keyed by ``deterministic``
+    :param reward_scale: c_i, ``(n_tasks,)``
+    """
+    table = evaluations[True].table()
+    table.insert(1, "success_sampled", evaluations[False].success)
+    table["c"] = reward_scale
+    return table
+
+
+def run_versions() -> dict[str, Any]:
+    """Return the versions and the hardware that numbers depend on."""
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cpus": len(psutil.Process().cpu_affinity())
+        if hasattr(psutil.Process, "cpu_affinity")
+        else psutil.cpu_count(),
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
+        "packages": {name: _version(name) for name in _VERSIONS_OF},
+    }
+
+
+def env_names(model: MultiTaskOffPolicyAlgorithm) -> list[str]:
+    """Return the task names of a multi-task model."""
+    assert model.task_names is not None
+    return model.task_names
+
+
+def _learn(
+    model: MultiTaskOffPolicyAlgorithm,
+    config: RunConfig,
+    evaluation_env: VecEnv,
+    protocol: EvaluationProtocol,
+    folder: Path,
+    progress_bar: bool,
+) -> bool:
+    """Train; return whether the user interrupted."""
+    callbacks: list[BaseCallback] = []
+    if config.evaluation.every is not None:
+        callbacks.append(
+            TaskEvalCallback(
+                evaluation_env,
+                config.evaluation.every,
+                protocol,
+                best_model_save_path=folder,
+                log_path=folder,
+            )
+        )
+    try:
+        model.learn(
+            config.algorithm.total_timesteps,
+            callback=callbacks,
+            log_interval=config.log_interval,
+            progress_bar=progress_bar,
+        )
+    except KeyboardInterrupt:
+        print(f"\nInterrupted at step {model.num_timesteps:,}; evaluating and saving what was learned.")
+        return True
+    return False
+
+
+def _make_evaluation_env(config: RunConfig, protocol: EvaluationProtocol) -> VecEnv:
+    if config.env.tasks == "toy":
+        return make_toy_env(seed=config.seed, max_episode_steps=config.env.max_episode_steps)
+    return make_evaluation_env(_task_list(config.env.tasks), protocol, n_workers=config.env.n_workers)
+
+
+def _evaluate_both(
+    model: MultiTaskOffPolicyAlgorithm, env: VecEnv, protocol: EvaluationProtocol, progress_bar: bool
+) -> dict[bool, TaskEvaluation]:
+    return {
+        deterministic: evaluate_tasks(model, env, protocol, deterministic, progress_bar=progress_bar)
+        for deterministic in (True, False)
+    }
+
+
+def _write_result(
+    folder: Path,
+    table: pd.DataFrame,
+    protocol: EvaluationProtocol,
+    model: MultiTaskOffPolicyAlgorithm,
+    seconds: float,
+    interrupted: bool,
+) -> None:
+    table.to_csv(folder / "evaluation.csv")
+    _write_json(
+        folder / "result.json",
+        {
+            "mean_success": float(table["success"].mean()),
+            "mean_success_sampled": float(table["success_sampled"].mean()),
+            "tasks": json.loads(table.to_json(orient="index")),
+            "protocol": protocol.describe(),
+            "timesteps": model.num_timesteps,
+            "updates": model._n_updates,
+            "resets": model.n_resets,
+            "reward_scale_history": model.reward_scale_history,
+            "training_seconds": round(seconds, 1),
+            "interrupted": interrupted,
+        },
+    )
+
+
+def _make_folder(config: RunConfig, name: str) -> Path:
+    stem = config.output / f"{name}-seed{config.seed}"
+    folder, number = stem, 2
+    while folder.exists():
+        folder, number = stem.with_name(f"{stem.name}-{number}"), number + 1
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise ConfigError(
+            f"The run's folder {folder} cannot be made ({error.strerror}); choose another --output."
+        ) from error
+    return folder
+
+
+def _task_list(tasks: str | tuple[str, ...]) -> str | list[str]:
+    return tasks if isinstance(tasks, str) else list(tasks)
+
+
+def _write_json(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

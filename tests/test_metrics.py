@@ -1,0 +1,54 @@
+"""Summary numbers against hand-worked ones and an independent calculation."""
+
+import numpy as np
+import pytest
+
+from sb3_ars.errors import ConfigError
+from sb3_ars.metrics import bottom_k, estr, iqm, iqm_interval
+
+
+def test_bottom_k_is_the_mean_of_the_k_worst():
+    success = [1.0, 0.2, 0.9, 0.0, 0.4]
+    assert bottom_k(success, 2) == pytest.approx(0.1)
+    assert bottom_k(success, 3) == pytest.approx(0.2)
+    assert bottom_k(success, 5) == pytest.approx(0.5)
+
+
+def test_estr_counts_tasks_at_or_above_the_threshold():
+    success = [0.0, 0.1, 0.3, 0.69, 1.0]
+    assert [estr(success, d) for d in (0.1, 0.3, 0.5, 0.7)] == pytest.approx([0.8, 0.6, 0.4, 0.2])
+
+
+def test_iqm_drops_the_lowest_and_highest_quarter():
+    assert iqm([[0, 1], [2, 3], [4, 5], [6, 100]]) == pytest.approx((2 + 3 + 4 + 5) / 4)
+
+
+def test_iqm_interval_agrees_with_a_plain_stratified_bootstrap():
+    scores = np.random.default_rng(1).uniform(size=(6, 4))
+    interval = iqm_interval(scores, n_resamples=4000)
+    rng = np.random.default_rng(2)
+    resampled = []
+    for _ in range(4000):
+        rows = rng.integers(0, 6, size=(6, 4))
+        values = np.sort(np.take_along_axis(scores, rows, axis=0).ravel())
+        resampled.append(values[6:-6].mean())
+    low, high = np.percentile(resampled, [2.5, 97.5])
+    assert interval.estimate == pytest.approx(np.sort(scores.ravel())[6:-6].mean())
+    assert interval.low == pytest.approx(low, abs=0.01) and interval.high == pytest.approx(high, abs=0.01)
+
+
+@pytest.mark.parametrize("k", [0, 6])
+def test_bottom_k_refuses_a_k_that_no_tasks_fit(k):
+    with pytest.raises(ConfigError, match="between 1 and the number of tasks, 5"):
+        bottom_k([0.0] * 5, k)
+
+
+@pytest.mark.parametrize("scores", [[], [[1.0, float("nan")]], [1.0, 2.0]])
+def test_scores_that_are_no_finite_table_are_refused(scores):
+    with pytest.raises(ConfigError):
+        iqm_interval(scores)
+
+
+def test_an_interval_needs_two_seeds():
+    with pytest.raises(ConfigError, match="two seeds"):
+        iqm_interval([[0.1, 0.2]])
