@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -99,16 +101,16 @@ def _metaworld() -> Check:
 
 
 def _rendering() -> Check:
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
-    try:
-        with mujoco.Renderer(model, 16, 16) as renderer:
-            renderer.update_scene(mujoco.MjData(model))
-            renderer.render()
-    except Exception as error:
+    # in a process of its own: a missing GL library can abort the process, or fill the screen with warnings
+    script = (
+        "import mujoco\n"
+        "model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\"1\"/></worldbody></mujoco>')\n"
+        "mujoco.Renderer(model, 16, 16).render()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
+    )
+    if done.returncode:
         remedy = "install libegl1 or libosmesa6 and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
-        return Check(
-            "rendering", True, f"none ({type(error).__name__}); training needs none, for videos {remedy}"
-        )
-    return Check("rendering", True, f"works (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'default')})")
+        return Check("rendering", True, f"not available; training needs none. For videos {remedy}")
+    return Check("rendering", True, f"works (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'unset')})")

@@ -453,8 +453,6 @@ def test_a_hindsight_model_loads_with_its_env_only(algorithm, tmp_path):
     loaded = algorithm.load(tmp_path / "model", env=goals())
     loaded.load_replay_buffer(tmp_path / "buffer", truncate_last_traj=False)
     assert loaded.replay_buffer.size() == 30
-    with pytest.warns(UserWarning, match="will be truncated"):
-        loaded.load_replay_buffer(tmp_path / "buffer")
     loaded.learn(10, reset_num_timesteps=False)
     assert loaded.num_timesteps == 40 and loaded._n_updates == model._n_updates + 10
 

@@ -6,8 +6,10 @@ Arithmetic lives in ``sb3_ars.core``; what happens when is ``ARSCallback``'s to 
 from __future__ import annotations
 
 import io
+import json
 import pathlib
 import warnings
+import zipfile
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -19,7 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Conve
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -186,6 +188,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self.config  # noqa: B018  # validates: load() replaces attributes after the constructor's own check
+        if _is_auto(self.learning_starts):  # given to load()
+            self.learning_starts = self._auto_learning_starts = 0
         self._check_options()
         self._read_tasks(self.env)
         if self.is_multi_task and self._uses_task_buffer():
@@ -221,10 +225,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
                 raise ConfigError(f"{option}={value!r} must be an integer of at least 1.")
 
     def _read_tasks(self, env: VecEnv | None) -> None:
-        """Take names and order of the tasks from the environment, once; later environments must agree."""
+        """Take names and order of the tasks from the environment; load() and set_env() see to it that they agree."""
         if env is not None:
             names = task_names_of(env)
-            self._check_same_tasks(names)
             self.is_multi_task = names is not None
             self.task_names = names
             self.task_of_env = (
@@ -250,14 +253,6 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             raise ConfigError(
                 f"batch_size={self.batch_size} rows per task is more than buffer_size={self.buffer_size} per task "
                 "can ever hold; raise buffer_size or lower batch_size."
-            )
-
-    def _check_same_tasks(self, names: list[str] | None) -> None:
-        if self.task_names is not None and names != self.task_names:
-            given = "a plain environment" if names is None else f"tasks {names}"
-            raise ConfigError(
-                f"This model was made for the tasks {self.task_names}, in this order, but the environment has {given}. "
-                "Make the environment with the model's task list."
             )
 
     def _uses_task_buffer(self) -> bool:
@@ -310,7 +305,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :raises ConfigError: if its tasks differ
         """
         wrapped = self._wrap_env(env, self.verbose)
-        self._check_same_tasks(task_names_of(wrapped))
+        if task_names_of(wrapped) != self.task_names:
+            raise ConfigError(
+                f"This model was made for {_describe(self.task_names)}, but the environment has "
+                f"{_describe(task_names_of(wrapped))}. Make the environment with the model's task list, in its order."
+            )
         super().set_env(wrapped, force_reset)
         self._read_tasks(self.env)
         if isinstance(self.replay_buffer, TaskReplayBuffer):
@@ -629,11 +628,14 @@ def task_names_of(env: GymEnv) -> list[str] | None:
 
 def _check_saved_tasks(path: str | pathlib.Path | io.BufferedIOBase, names: list[str] | None) -> None:
     """Name the tasks before SB3 compares spaces, whose error shows two boxes of numbers."""
-    start = path.tell() if isinstance(path, io.IOBase) else None
-    data, _, _ = load_from_zip_file(path, device="cpu")
-    if start is not None:
-        path.seek(start)  # type: ignore[union-attr]  # a file, since start was read from it
-    saved = (data or {}).get("task_names")
+    file = open_path(path, "r", verbose=0, suffix="zip")
+    start = file.tell()
+    with zipfile.ZipFile(file) as archive:
+        saved = json.loads(archive.read("data")).get("task_names")
+    if file is path:
+        file.seek(start)
+    else:
+        file.close()
     if saved != names:
         raise ConfigError(
             f"{path} was trained on {_describe(saved)}, but the environment has {_describe(names)}. Make the "

@@ -68,6 +68,8 @@ class AlgorithmConfig:
     """Discount."""
     tau: float = 0.005
     """Weight of the new critics in the target critics, per update."""
+    stats_window_size: int = 100
+    """Latest episodes of each task that the log's success and return average over."""
     device: str = "auto"
     """Where networks and buffers live: auto, cpu or cuda."""
 
