@@ -131,7 +131,7 @@ def _print_table(frame: pd.DataFrame, protocol: str) -> None:
 
 
 def _usage() -> str:
-    from sb3_ars.experiments.config import preset_names
+    from sb3_ars.experiments import preset_names
 
     return _USAGE.format(presets=", ".join(preset_names()))
 

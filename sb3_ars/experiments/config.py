@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_type_hints
 
@@ -13,6 +12,7 @@ import yaml
 
 from sb3_ars.config import ARSConfig
 from sb3_ars.errors import ConfigError, nearest
+from sb3_ars.experiments import PRESETS, preset_names
 
 __all__ = [
     "AlgorithmConfig",
@@ -22,7 +22,6 @@ __all__ = [
     "RunConfig",
     "load_config",
     "load_preset",
-    "preset_names",
     "save_config",
 ]
 
@@ -125,17 +124,10 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
-def preset_names() -> list[str]:
-    """Return the names of the presets that ship with the package."""
-    return sorted(
-        path.name.removesuffix(".yaml") for path in _presets().iterdir() if path.name.endswith(".yaml")
-    )
-
-
 def load_preset(name: str) -> RunConfig:
     """Return the configuration of a preset.
 
-    :param name: one of :func:`preset_names`
+    :param name: one of :func:`~sb3_ars.experiments.preset_names`
     :raises ConfigError: if there is none of that name, or its file holds an unknown key
     """
     return _build(RunConfig, _preset_values(name), f"preset {name!r}")
@@ -164,17 +156,13 @@ def save_config(config: RunConfig, path: Path) -> None:
     path.write_text(yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False), encoding="utf-8")
 
 
-def _presets() -> Any:
-    return resources.files("sb3_ars.experiments") / "presets"
-
-
 def _preset_values(name: str) -> dict[str, Any]:
     names = preset_names()
     if name not in names:
         raise ConfigError(
             f"There is no preset {name!r}; there are {', '.join(names)}." + nearest(name, names)
         )
-    values: dict[str, Any] = yaml.safe_load((_presets() / f"{name}.yaml").read_text(encoding="utf-8"))
+    values: dict[str, Any] = yaml.safe_load((PRESETS / f"{name}.yaml").read_text(encoding="utf-8"))
     base = values.pop("extends", None)
     return values if base is None else _merged(_preset_values(base), values)
 

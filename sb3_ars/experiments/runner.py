@@ -249,6 +249,10 @@ def _learn(
     except KeyboardInterrupt:
         print(f"\nInterrupted at step {model.num_timesteps:,}; evaluating and saving what was learned.")
         return True
+    finally:
+        if model.num_timesteps > 0:
+            model.dump_logs()  # so that the log's last row is the run's last step
+        model.logger.close()
     return False
 
 

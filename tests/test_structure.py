@@ -1,0 +1,116 @@
+"""The package's structure and documents: who imports whom, what is exported, what the README promises."""
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sb3_ars
+
+ROOT = Path(sb3_ars.__file__).parent
+LAYER = {  # each may import those before it, and its own
+    "errors": 0, "core": 1, "nets": 2, "metrics": 2, "config": 2, "envs": 2, "buffers": 3, "policies": 3,
+    "callbacks.ars": 4,  # beneath the algorithms, whose learn() installs it
+    "algorithms": 5, "evaluation": 5, "callbacks": 6, "experiments": 7, "doctor": 7, "cli": 8, "": 9,
+}  # fmt: skip
+
+
+def layer_of(module):
+    for name in (module, module.split(".")[0]):
+        if name in LAYER:
+            return LAYER[name]
+    raise AssertionError(f"give the new module {module} a layer")
+
+
+def imports_of(path):
+    """Names inside the package a module imports at run time, wherever the import stands."""
+    tree = ast.parse(path.read_text())
+    typing_only = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.dump(block.test)
+        for node in ast.walk(block)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and id(node) not in typing_only:
+            yield node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def modules():
+    for path in sorted(ROOT.rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        yield name.removesuffix("__init__").removesuffix("."), path
+
+
+def test_imports_go_one_way():
+    for name, path in modules():
+        for imported in imports_of(path):
+            if imported.startswith("sb3_ars."):
+                inner = imported.removeprefix("sb3_ars.")
+                assert layer_of(inner) <= layer_of(name), f"{name} imports {inner}"
+
+
+@pytest.mark.parametrize("package", ["core", "nets"])
+def test_the_method_knows_no_sb3_and_no_environments(package):
+    for path in (ROOT / package).glob("*.py"):
+        for imported in imports_of(path):
+            assert imported.split(".")[0] not in (
+                "stable_baselines3",
+                "sb3_contrib",
+                "gymnasium",
+                "metaworld",
+            ), path
+
+
+def test_every_exported_name_exists_and_has_a_docstring():
+    for name in sb3_ars.__all__:
+        assert getattr(sb3_ars, name).__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'ARS'"):
+        sb3_ars.ARS  # noqa: B018  # sb3-contrib's ARS is Augmented Random Search; ours is never called so
+
+
+def test_every_module_says_what_it_is_for():
+    for name, path in modules():
+        assert ast.get_docstring(ast.parse(path.read_text())), name or "sb3_ars"
+
+
+def test_importing_the_package_or_its_envs_loads_no_torch():
+    script = "import sys, sb3_ars, sb3_ars.envs.workers, sb3_ars.envs.toy; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_the_readmes_python_example_runs_but_for_its_length():
+    readme = (ROOT.parent / "README.md").read_text()
+    code = readme.split("```python\n")[1].split("```")[0]
+    assert 'make_metaworld_env("MT10"' in code and "ARSSAC(" in code
+    code = code.replace('make_metaworld_env("MT10"', "make_toy_env(").replace(
+        "make_toy_env(,", "make_toy_env("
+    )
+    code = code.replace("20_000_000", "600").replace(
+        "import ARSSAC, make_metaworld_env", "import ARSSAC, make_toy_env"
+    )
+    code = code.replace("n_reset=4", "n_reset=1, batch_size=8, policy_kwargs={'net_arch': [8]}")
+    namespace = {}
+    exec(code.replace('tensorboard_log="runs"', "tensorboard_log=None").split("model.save")[0], namespace)
+    assert namespace["model"].num_timesteps == 600
+
+
+def test_the_readmes_table_names_real_presets_and_commands():
+    from sb3_ars.experiments import preset_names
+
+    readme = (ROOT.parent / "README.md").read_text()
+    for name in preset_names():
+        assert f"`{name}`" in readme, name
+    for target in ("make demo", "make test"):
+        assert target in readme
+
+
+def test_the_version_is_the_changelogs():
+    changelog = (ROOT.parent / "CHANGELOG.md").read_text()
+    assert f"## {importlib.import_module('sb3_ars').__version__}" in changelog
