@@ -354,6 +354,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        self._last_dump_at = -1
         starts_afresh = reset_num_timesteps or self.num_timesteps == 0
         self._resolve_learning_starts(total_timesteps, starts_afresh)
         if isinstance(self.replay_buffer, TaskReplayBuffer):
@@ -380,6 +381,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = CallbackList(callback) if isinstance(callback, list) else callback
+        if any(isinstance(found, ARSCallback) for found in _inside_events(given)):
+            raise ConfigError(
+                "An ARSCallback inside an event callback is never told of rollouts, so it would never reset; pass it "
+                "to learn() directly or in a list."
+            )
         if not any(isinstance(found, ARSCallback) for found in _walk(given)):
             # before the others, so that a checkpoint or evaluation in the same step sees the networks after a reset
             others = (
@@ -532,7 +538,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self.num_timesteps == self._last_dump_at:
             return  # SB3 asks once per ended episode, and the horizons of several tasks end together
         self._last_dump_at = self.num_timesteps
-        self._task_log.record(self.logger, self._n_updates)
+        self._task_log.record(self.logger, self._n_updates, self.log_ent_coef is not None)
         if self.is_multi_task:
             assert isinstance(self.replay_buffer, TaskReplayBuffer)
             self._task_log.record_scale(
@@ -654,13 +660,19 @@ def _plain_statistics(replay_buffer: ReplayBuffer | None) -> RewardStatistics:
 
 
 def _walk(callback: Any) -> Iterator[Any]:
-    """Yield a callback and those inside it."""
+    """Yield a callback and, of a list, those in it."""
     yield callback
     if isinstance(callback, CallbackList):
         for child in callback.callbacks:
             yield from _walk(child)
-    elif isinstance(callback, EventCallback):
-        yield from _walk(callback.callback)
+
+
+def _inside_events(callback: Any) -> Iterator[Any]:
+    """Yield the callbacks inside event callbacks, to which SB3 2.9.2 (callbacks.py) forwards no rollout hooks."""
+    for found in _walk(callback):
+        if isinstance(found, EventCallback):
+            yield from _walk(found.callback)
+            yield from _inside_events(found.callback)
 
 
 def _is_auto(learning_starts: object) -> bool:

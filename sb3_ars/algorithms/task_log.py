@@ -47,11 +47,12 @@ class TaskLog:
         self._sums = metrics if self._sums is None else Metrics(*map(th.add, self._sums, metrics))
         self._n_updates += 1
 
-    def record(self, logger: Logger, n_updates: int) -> None:
+    def record(self, logger: Logger, n_updates: int, temperature_is_learned: bool) -> None:
         """Write means since the last call under SB3's keys and, per task, ours.
 
         :param logger: SB3's
         :param n_updates: gradient steps of the whole run
+        :param temperature_is_learned: whether there is a temperature loss to report
         """
         for key, values in self._episode_means().items():
             self._record_tasks(logger, key, values)
@@ -66,7 +67,8 @@ class TaskLog:
         logger.record("train/ent_coef", float(np.mean(ent_coef)))
         logger.record("train/actor_loss", actor_loss)
         logger.record("train/critic_loss", critic_loss)
-        logger.record("train/ent_coef_loss", ent_coef_loss)
+        if temperature_is_learned:
+            logger.record("train/ent_coef_loss", ent_coef_loss)
         if self.task_names:
             self._record_tasks(logger, "q_value", q_value)
             self._record_tasks(logger, "ent_coef", np.broadcast_to(ent_coef, len(self.task_names)).tolist())

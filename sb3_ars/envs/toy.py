@@ -89,7 +89,7 @@ def make_toy_env(
     seed: int | None = None,
     n_envs_per_task: int = 1,
     n_workers: int | str = 0,
-    reward_scales: Sequence[float] = (10.0, 3.0, 0.3, 0.1),
+    reward_scales: Sequence[float] = (10.0, 1.0, 0.1, 0.1),
     max_episode_steps: int = 50,
     start_method: str = "spawn",
     worker_timeout: float = 30.0,

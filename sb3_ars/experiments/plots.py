@@ -10,11 +10,13 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from sb3_ars.algorithms.task_log import log_names
 
 __all__ = ["plot_training"]
 
+_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 _LABELLED_TASKS = 10  # more labels than this cannot be told apart
 
 
@@ -55,6 +57,8 @@ def plot_training(
         yscale="log",
     )
     scale_axis.set_xlim(0, last / divisor)
+    scale_axis.yaxis.set_major_formatter(_PLAIN)
+    scale_axis.yaxis.set_minor_formatter(_PLAIN if _decades(reward_scale_history) < 1 else NullFormatter())
     if len(task_names) <= _LABELLED_TASKS:
         figure.legend(*success_axis.get_legend_handles_labels(), loc="outside right upper", frameon=False)
     for axis in (success_axis, scale_axis):
@@ -85,8 +89,14 @@ def _mark_resets(axes: Sequence[Any], history: Sequence[tuple[int, Sequence[floa
             axis.axvline(time / divisor, color="black", lw=0.8, ls=":")
         axes[0].annotate(
             "reset" if index == 0 else "",
-            (time / divisor, 1.0),
-            xytext=(3, -8),
+            (time / divisor, 0.0),
+            xytext=(3, 2),
             textcoords="offset points",
             fontsize=8,
         )
+
+
+def _decades(history: Sequence[tuple[int, Sequence[float]]]) -> float:
+    """Return how many powers of ten the scales span."""
+    values = [scale for _, scales in history for scale in scales] or [1.0]
+    return float(np.log10(max(values) / min(values)))
