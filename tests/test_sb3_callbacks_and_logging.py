@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 from sb3_ars import ARSSAC, ARSTQC, ARSCallback, make_toy_env
+from sb3_ars.errors import ConfigError
 
 BOTH = pytest.mark.parametrize("algorithm", [ARSSAC, ARSTQC])
 PAIRS = [pytest.param(ARSSAC, SAC, id="sac"), pytest.param(ARSTQC, TQC, id="tqc")]
@@ -114,7 +115,11 @@ def test_every_hook_is_called_as_often_as_by_sb3(ours, theirs):
         callback = Count()
         make(algorithm, train_freq=3).learn(30, callback)
         counts.append(callback)
-    assert counts[0].hooks == counts[1].hooks == {"start": 1, "rollout": 10, "step": 30, "rollout_end": 10, "end": 1}
+    assert (
+        counts[0].hooks
+        == counts[1].hooks
+        == {"start": 1, "rollout": 10, "step": 30, "rollout_end": 10, "end": 1}
+    )
     assert counts[0].n_calls == counts[1].n_calls == 30
     assert {"new_obs", "rewards", "dones", "infos", "actions", "total_timesteps"} <= counts[0].locals.keys()
 
@@ -171,7 +176,9 @@ def test_evaluation_writes_its_results_the_best_model_and_calls_its_callbacks(al
 def test_training_stops_at_a_reward_threshold(algorithm):
     model = make(algorithm)
     stop = StopTrainingOnRewardThreshold(reward_threshold=-1000.0)
-    model.learn(60, EvalCallback(env(), callback_on_new_best=stop, eval_freq=20, n_eval_episodes=1, verbose=0))
+    model.learn(
+        60, EvalCallback(env(), callback_on_new_best=stop, eval_freq=20, n_eval_episodes=1, verbose=0)
+    )
     assert model.num_timesteps == 20
 
 
@@ -179,7 +186,9 @@ def test_training_stops_at_a_reward_threshold(algorithm):
 def test_training_stops_without_improvement_and_at_a_number_of_episodes(algorithm):
     model = make(algorithm)
     stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=0, min_evals=0)
-    model.learn(100, EvalCallback(env(), callback_after_eval=stop, eval_freq=10, n_eval_episodes=1, verbose=0))
+    model.learn(
+        100, EvalCallback(env(), callback_after_eval=stop, eval_freq=10, n_eval_episodes=1, verbose=0)
+    )
     assert 10 <= model.num_timesteps < 100
     model = make(algorithm)
     model.learn(100, StopTrainingOnMaxEpisodes(max_episodes=3))
@@ -235,8 +244,10 @@ def test_the_progress_bar_counts_to_the_end(algorithm, monkeypatch):
 
 def children(callback):
     """Every callback in a tree of callbacks."""
-    inner = list(getattr(callback, "callbacks", [])) + [getattr(callback, "callback", None)]
-    return [callback] + [found for child in inner if isinstance(child, BaseCallback) for found in children(child)]
+    inner = [*getattr(callback, "callbacks", []), getattr(callback, "callback", None)]
+    return [callback] + [
+        found for child in inner if isinstance(child, BaseCallback) for found in children(child)
+    ]
 
 
 CALLBACKS = {
@@ -248,8 +259,13 @@ CALLBACKS = {
     "ours": ARSCallback,
     "ours_in_a_list": lambda: [Count(), ARSCallback()],
     "ours_in_nested_lists": lambda: CallbackList([Count(), CallbackList([ARSCallback()])]),
-    "ours_in_an_event": lambda: EveryNTimesteps(5, ARSCallback()),
-    "ours_in_an_event_in_a_list": lambda: [Count(), EveryNTimesteps(5, ARSCallback())],
+}
+IN_EVENTS = {
+    "event": lambda: EveryNTimesteps(5, ARSCallback()),
+    "event_in_a_list": lambda: [Count(), EveryNTimesteps(5, ARSCallback())],
+    "list_in_an_event": lambda: EveryNTimesteps(5, CallbackList([Count(), ARSCallback()])),
+    "after_evaluation": lambda: EvalCallback(env(), callback_after_eval=ARSCallback()),
+    "on_new_best": lambda: EvalCallback(env(), callback_on_new_best=ARSCallback()),
 }
 
 
@@ -274,6 +290,22 @@ def test_resets_happen_exactly_once_whatever_callback_is_passed(callback):
 def test_exactly_one_ars_callback_is_installed(callback, progress_bar):
     installed = make(ARSSAC)._init_callback(callback(), progress_bar)
     assert sum(isinstance(found, ARSCallback) for found in children(installed)) == 1
+
+
+@pytest.mark.parametrize("callback", IN_EVENTS.values(), ids=IN_EVENTS.keys())
+def test_an_ars_callback_that_no_rollout_would_reach_is_refused(callback):
+    """SB3 2.9.2 (common/callbacks.py): an event callback tells those inside it of steps, not of rollouts."""
+    model = make(ARSSAC)
+    with pytest.raises(ConfigError, match="ARSCallback inside an event callback"):
+        model.learn(30, callback())
+    assert model.num_timesteps == 0
+
+
+def test_event_callbacks_still_tell_those_inside_of_steps_only():
+    """Once SB3 forwards rollouts, an ARSCallback inside need no longer be refused."""
+    inner = Count()
+    make(SAC).learn(20, EveryNTimesteps(5, inner))
+    assert inner.hooks["step"] == 4 and inner.hooks["rollout"] == inner.hooks["rollout_end"] == 0
 
 
 def test_a_subclass_of_ars_callback_takes_the_place_of_ours():
@@ -382,7 +414,9 @@ def test_tensorboard_runs_are_named_after_the_class_and_numbered(algorithm, tmp_
     name = algorithm.__name__
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{name}_1", f"{name}_2", "named_1"]
     events = EventAccumulator(str(tmp_path / f"{name}_1")).Reload()
-    assert {"rollout/ep_rew_mean", "train/critic_loss", "train/learning_rate"} <= set(events.Tags()["scalars"])
+    assert {"rollout/ep_rew_mean", "train/critic_loss", "train/learning_rate"} <= set(
+        events.Tags()["scalars"]
+    )
     assert [event.step for event in events.Scalars("train/critic_loss")] == [15, 20]
 
 
@@ -404,7 +438,12 @@ def test_each_task_s_numbers_are_logged(algorithm):
     for key in ("success", "return", "reward_scale", "mean_reward", "q_value", "ent_coef"):
         assert [name for name in last if name.startswith(f"{key}/")] == [f"{key}/{name}" for name in names]
     assert {"rollout/mean_success", "rollout/success_rate", "rollout/ep_rew_mean"} <= last.keys()
-    assert {"train/ent_coef_loss", "train/actor_loss", "train/learning_rate", "train/n_updates"} <= last.keys()
+    assert {
+        "train/ent_coef_loss",
+        "train/actor_loss",
+        "train/learning_rate",
+        "train/n_updates",
+    } <= last.keys()
     assert last["train/ent_coef"] == pytest.approx(np.mean([last[f"ent_coef/{name}"] for name in names]))
 
 

@@ -45,7 +45,9 @@ class Drift(gym.Env):
 
 
 def drift(observation_space=None, limit=7):
-    return TimeLimit(Drift(spaces.Box(-1.0, 3.0, (3,)) if observation_space is None else observation_space), limit)
+    return TimeLimit(
+        Drift(spaces.Box(-1.0, 3.0, (3,)) if observation_space is None else observation_space), limit
+    )
 
 
 def drifts(n_envs):
@@ -131,7 +133,9 @@ OPTIONS = {
         "optimize_memory_usage": True,
         "replay_buffer_kwargs": {"handle_timeout_termination": False},
     },
-    "optimizer": {"policy_kwargs": SMALL | {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"eps": 1e-5}}},
+    "optimizer": {
+        "policy_kwargs": SMALL | {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"eps": 1e-5}}
+    },
     "separate_arch": {"policy_kwargs": SMALL | {"net_arch": {"pi": [8], "qf": [12, 8]}, "n_critics": 3}},
     "tanh": {"policy_kwargs": {"net_arch": [16], "activation_fn": nn.Tanh}},
 }
@@ -168,7 +172,9 @@ def test_action_noise_learns_to_the_bit(noise, n_envs):
     def action_noise():
         mean, sigma = np.zeros(2), np.full(2, 0.2)
         kind = OrnsteinUhlenbeckActionNoise if noise == "correlated" else NormalActionNoise
-        return VectorizedActionNoise(kind(mean, sigma), n_envs) if noise == "vectorized" else kind(mean, sigma)
+        return (
+            VectorizedActionNoise(kind(mean, sigma), n_envs) if noise == "vectorized" else kind(mean, sigma)
+        )
 
     models = [
         make(algorithm, drifts(n_envs), action_noise=action_noise()).learn(60) for algorithm in (ARSSAC, SAC)

@@ -1,4 +1,4 @@
-"""Prediction, observation and action spaces: what SB3's SAC and TQC take, ours take, and what they refuse, ours refuse."""
+"""Prediction, observation and action spaces: ours take what SB3's SAC and TQC take, and refuse what they refuse."""
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +25,9 @@ class Sampled(gym.Env):
     """Observations drawn from any space; remembers the actions it was given."""
 
     def __init__(self, observation_space=None, action_space=UNEVEN):
-        self.observation_space = spaces.Box(-1.0, 1.0, (3,)) if observation_space is None else observation_space
+        self.observation_space = (
+            spaces.Box(-1.0, 1.0, (3,)) if observation_space is None else observation_space
+        )
         self.action_space = action_space
         self.received = []
         self.poison = None
@@ -233,7 +235,7 @@ def test_policies_that_do_not_fit_the_observations_are_refused(algorithm):
     with pytest.raises(ValueError, match="unknown"):
         make(algorithm, policy="NoSuchPolicy")
     nested = spaces.Dict({"a": dictionary})
-    with pytest.raises(NotImplementedError, match="[Nn]ested"):
+    with pytest.raises(NotImplementedError, match="ested"):
         make(algorithm, Sampled(nested), policy="MultiInputPolicy")
 
 

@@ -8,7 +8,6 @@ import zipfile
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from sb3_contrib import TQC
 from stable_baselines3 import SAC, HerReplayBuffer
@@ -231,7 +230,9 @@ def test_loading_prints_system_information_when_asked(trained, tmp_path, capsys)
     assert "CURRENT SYSTEM INFO" in printed and "SAVED MODEL SYSTEM INFO" in printed
 
 
-@pytest.mark.parametrize("options", [{}, {"ent_coef": 0.3}, {"ent_coef": "auto_0.2"}, {"n_steps": 3}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"ent_coef": 0.3}, {"ent_coef": "auto_0.2"}, {"n_steps": 3}], ids=str
+)
 @pytest.mark.parametrize(("ours", "theirs"), [(ARSSAC, SAC), (ARSTQC, TQC)])
 def test_training_after_a_load_is_sb3_s_to_the_bit(ours, theirs, options, tmp_path):
     models = []
@@ -547,8 +548,21 @@ def test_options_of_the_caller_are_not_changed():
     assert kwargs == SMALL and buffer_kwargs == {"handle_timeout_termination": True}
 
 
-def test_saved_paths_may_be_home_relative_strings_or_paths_alike(trained, tmp_path, monkeypatch):
+def test_relative_strings_and_paths_mean_the_same_file(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     trained.save("model")
     np.testing.assert_array_equal(actions(type(trained).load(pathlib.Path("model"))), actions(trained))
-    assert isinstance(trained.action_space, spaces.Box)
+
+
+@BOTH
+def test_a_reset_due_right_after_loading_without_a_buffer_does_not_crash(algorithm, tmp_path):
+    model = make(algorithm, param_resets=[20], updates_after_reset=2)
+    with pytest.warns(UserWarning, match="reaches beyond"):
+        model.learn(20)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env=env())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it may say that updates wait
+        loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.n_resets == 1 and loaded.num_timesteps == 40
+    assert loaded.reward_scale.scale.tolist() == [1.0]

@@ -202,7 +202,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.reward_scale = RewardScale(self.n_tasks, self.device)
         self._task_log = TaskLog(self.task_names or [], self._stats_window_size)
         self._update_state = self._make_update_state()
-        self._last_dump_at = -1
+        self._warned_of_waiting = False
 
     @property
     def config(self) -> ARSConfig:
@@ -226,29 +226,34 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _read_tasks(self, env: VecEnv | None) -> None:
         """Take names and order of the tasks from the environment; load() and set_env() see to it that they agree."""
-        if env is not None:
-            names = task_names_of(env)
-            self.is_multi_task = names is not None
-            self.task_names = names
-            self.task_of_env = (
-                [0] * env.num_envs if names is None else [int(task) for task in env.task_of_env]  # type: ignore[attr-defined]
-            )
-        if not self.is_multi_task:
+        if env is None:
+            return
+        names = task_names_of(env)
+        self._check_tasks(env, names)
+        self.is_multi_task = names is not None
+        self.task_names = names
+        self.task_of_env = (
+            [0] * env.num_envs if names is None else [int(task) for task in env.task_of_env]  # type: ignore[attr-defined]
+        )
+
+    def _check_tasks(self, env: VecEnv, names: list[str] | None) -> None:
+        """Raise if options or wrappers do not go with these tasks; change nothing."""
+        if names is None:
             return
         if self.n_steps > 1:
             raise ConfigError(f"n_steps={self.n_steps} is not available with several tasks; use n_steps=1.")
-        if self.n_tasks > 1 and not self._uses_task_buffer():
+        if len(names) > 1 and not self._uses_task_buffer():
             raise ConfigError(
                 f"replay_buffer_class={self.replay_buffer_class!r} mixes the tasks; leave it None, which gives "
                 "TaskReplayBuffer, or pass a subclass of that."
             )
-        normalizer = None if env is None else unwrap_vec_normalize(env)
+        normalizer = unwrap_vec_normalize(env)
         if normalizer is not None and normalizer.norm_reward:
             raise ConfigError(
                 "VecNormalize(norm_reward=True) normalises rewards with one statistic for all tasks; the reward scale "
                 "needs raw rewards. Use VecNormalize(norm_reward=False) and choose reward_scaling instead."
             )
-        parse_reward_scaling(self.reward_scaling, self.task_names or ())
+        parse_reward_scaling(self.reward_scaling, names)
         if self.batch_size > self.buffer_size:
             raise ConfigError(
                 f"batch_size={self.batch_size} rows per task is more than buffer_size={self.buffer_size} per task "
@@ -310,6 +315,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"This model was made for {_describe(self.task_names)}, but the environment has "
                 f"{_describe(task_names_of(wrapped))}. Make the environment with the model's task list, in its order."
             )
+        self._check_tasks(wrapped, self.task_names)
         super().set_env(wrapped, force_reset)
         self._read_tasks(self.env)
         if isinstance(self.replay_buffer, TaskReplayBuffer):
@@ -435,7 +441,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param gradient_steps: how many
         :param batch_size: rows per task
         """
-        if self._batch_is_missing(batch_size):
+        if not self.has_batch():
+            self._warn_of_waiting()
             return
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
@@ -464,18 +471,20 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Return standard normal noise for the actions at s and at s', in the order SB3 draws it."""
         return th.randn_like(actions), th.randn_like(actions)
 
-    def _batch_is_missing(self, batch_size: int) -> bool:
-        """Return whether updates must wait, which a run resumed without its buffer does; say so once."""
-        if not isinstance(self.replay_buffer, TaskReplayBuffer) or self.replay_buffer.size() >= batch_size:
-            return False
-        if not getattr(self, "_warned_of_waiting", False):
+    def has_batch(self) -> bool:
+        """Return whether the buffer holds a batch of every task; a run resumed without its buffer does not at first."""
+        assert self.replay_buffer is not None
+        wanted = self.batch_size if isinstance(self.replay_buffer, TaskReplayBuffer) else 1
+        return self.replay_buffer.size() >= wanted
+
+    def _warn_of_waiting(self) -> None:
+        if not self._warned_of_waiting:
             self._warned_of_waiting = True
             warnings.warn(
-                f"Updates wait until every task holds batch_size={batch_size} rows; the replay buffer was not loaded "
-                "or is new. Use load_replay_buffer to continue a run exactly.",
-                stacklevel=2,
+                f"Updates wait until every task holds batch_size={self.batch_size} rows; the replay buffer was not "
+                "loaded or is new. Use load_replay_buffer to continue a run exactly.",
+                stacklevel=3,
             )
-        return True
 
     # ------------------------------------------------------------------ the method's two actions
 
@@ -509,6 +518,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             fresh: Any = self.policy_class(
                 self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
             ).to(self.device)
+        if self.reset == "critic" and self.critic.share_features_extractor:
+            for critic in (fresh.critic, fresh.critic_target):  # the features are the actor's, which stays
+                reset_module_(critic.features_extractor, self.actor.features_extractor)
         reset_module_(self.critic, fresh.critic)
         reset_module_(self.critic_target, fresh.critic_target)
         reset_optimizer_(self.critic.optimizer)

@@ -83,7 +83,10 @@ class ARSCallback(BaseCallback):
     def reset(self) -> None:
         """Recompute c_i, reset the networks, do the extra updates (Algorithm 1, lines 14 to 17)."""
         model = self.algorithm
-        model.update_reward_scale()
+        if (
+            model.has_batch()
+        ):  # otherwise the run was resumed without its buffer, and the scale it had is the best there is
+            model.update_reward_scale()
         model.reset_networks()
         model.last_reset_at = model.num_timesteps
         self._print_scale(f"reset {model.n_resets} of {len(self.reset_times)}")

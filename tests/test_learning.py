@@ -1,0 +1,34 @@
+"""Seeded learning on the toy tasks: ARS learns every task, and ARS is why."""
+
+import numpy as np
+import pytest
+
+from benchmarks.toy_learning import final_success
+
+SEEDS = range(5)
+
+
+@pytest.fixture(scope="module")
+def success():
+    """(arm, seed) -> success of each task, loudest first; one seed of each arm takes about a minute."""
+    results = {}
+
+    def of(arm, seed):
+        if (arm, seed) not in results:
+            results[arm, seed] = final_success(arm, seed)
+        return results[arm, seed]
+
+    return of
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_ars_learns_every_toy_task(success, seed):
+    assert min(success("ars", seed)) >= 0.9, success("ars", seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_without_scaling_and_resets_the_quiet_tasks_stay_under_half_of_that(success, seed):
+    loud, quiet = success("sac", seed)[:2], success("sac", seed)[2:]
+    assert max(quiet) < 0.45 and np.mean(loud) > 0.8, success("sac", seed)
