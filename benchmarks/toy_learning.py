@@ -1,7 +1,7 @@
 """ARS beside plain multi-task SAC on the toy tasks, several seeds: does every task learn, and is ARS why?
 
-Both arms are the preset ``toy`` with the same budget; the second has no scaling and no reset. Success is the share of 50
-deterministic episodes per task that touch the goal, on environments of their own.
+Both arms are the preset ``toy`` with the same budget; the second has no scaling and no reset. Success is the share of
+50 deterministic episodes per task that touch the goal, on environments of their own.
 
     python benchmarks/toy_learning.py --seeds 5
 """
@@ -30,7 +30,9 @@ def config_of(arm: str, seed: int) -> RunConfig:
     config = dataclasses.replace(load_preset("toy"), seed=seed)
     evaluation = dataclasses.replace(config.evaluation, n_episodes=50)
     if arm == "sac":
-        ars = dataclasses.replace(config.ars, n_reset=None, param_resets=None, reward_scaling="none", reset="none")
+        ars = dataclasses.replace(
+            config.ars, n_reset=None, param_resets=None, reward_scaling="none", reset="none"
+        )
         config = dataclasses.replace(config, ars=ars)
     return dataclasses.replace(config, evaluation=evaluation)
 
@@ -46,7 +48,9 @@ def final_success(arm: str, seed: int) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()

@@ -683,8 +683,9 @@ def _inside_events(callback: Any) -> Iterator[Any]:
     """Yield the callbacks inside event callbacks, to which SB3 2.9.2 (callbacks.py) forwards no rollout hooks."""
     for found in _walk(callback):
         if isinstance(found, EventCallback):
-            yield from _walk(found.callback)
-            yield from _inside_events(found.callback)
+            for child in (found.callback, getattr(found, "callback_on_new_best", None)):
+                yield from _walk(child)
+                yield from _inside_events(child)
 
 
 def _is_auto(learning_starts: object) -> bool:
