@@ -165,7 +165,7 @@ def build_model(config: RunConfig, env: VecEnv) -> MultiTaskOffPolicyAlgorithm:
             "optimizer_kwargs": {"fused": policy.fused_optimizer},
         },
         seed=config.seed,
-        verbose=config.verbose,
+        verbose=1,  # the buffer's size, and each reset with its scales
         **options,
         **{f.name: getattr(config.ars, f.name) for f in dataclasses.fields(config.ars)},
     )
