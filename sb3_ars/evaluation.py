@@ -66,8 +66,10 @@ PROTOCOLS = {
     "paper": EvaluationProtocol("paper", n_episodes=10, max_episode_steps=500),
     "metaworld": EvaluationProtocol("metaworld", n_episodes=50, max_episode_steps=500),
     "h150": EvaluationProtocol("h150", n_episodes=10, max_episode_steps=150),
+    "env": EvaluationProtocol("env", n_episodes=10, max_episode_steps=None, goals=None),
 }
-"""``paper``: ARS, section 5; ``metaworld``: Meta-World+'s 50 goals; ``h150``: ARS, appendix E.4."""
+"""``paper``: ARS, section 5; ``metaworld``: Meta-World+'s 50 goals; ``h150``: ARS, appendix E.4; ``env``:
+tasks that are not Meta-World's, as their environment has them."""
 
 
 @dataclass(frozen=True)
