@@ -254,7 +254,7 @@ class TaskReplayBuffer(ReplayBuffer):
             return
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name).to(self._device))
-        if self._generator.device != self._device:
+        if self._generator.device.type != self._device.type:
             self._generator = self._make_generator()
 
     def __getstate__(self) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
     save_config(config, folder / "config.yaml")
     _write_json(folder / "versions.json", run_versions())
     with closing(make_env(config)) as env:
-        model = build_model(config, env)
+        model = build_model(config, env, verbose=1)
         outputs = ["csv", "tensorboard", *(["stdout"] if config.verbose else [])]
         model.set_logger(configure(str(folder), outputs))
         started = time.monotonic()
@@ -146,8 +146,13 @@ def make_env(config: RunConfig) -> VecEnv:
     return make_metaworld_env(_task_list(env.tasks), goals=env.goals, **common)
 
 
-def build_model(config: RunConfig, env: VecEnv) -> MultiTaskOffPolicyAlgorithm:
-    """Return the untrained model of a configuration."""
+def build_model(config: RunConfig, env: VecEnv, verbose: int = 0) -> MultiTaskOffPolicyAlgorithm:
+    """Return the untrained model of a configuration.
+
+    :param config: of the run
+    :param env: its training environments
+    :param verbose: 1 prints the buffer's size and each reset with its scales
+    """
     options = dataclasses.asdict(config.algorithm)
     algorithm = _ALGORITHMS[options.pop("algorithm")]
     del options["total_timesteps"]
@@ -165,7 +170,7 @@ def build_model(config: RunConfig, env: VecEnv) -> MultiTaskOffPolicyAlgorithm:
             "optimizer_kwargs": {"fused": policy.fused_optimizer},
         },
         seed=config.seed,
-        verbose=1,  # the buffer's size, and each reset with its scales
+        verbose=verbose,
         **options,
         **{f.name: getattr(config.ars, f.name) for f in dataclasses.fields(config.ars)},
     )
