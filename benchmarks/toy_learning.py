@@ -30,7 +30,7 @@ def config_of(arm: str, seed: int) -> RunConfig:
     config = dataclasses.replace(load_preset("toy"), seed=seed)
     evaluation = dataclasses.replace(config.evaluation, n_episodes=50)
     if arm == "sac":
-        ars = dataclasses.replace(config.ars, n_reset=0, reward_scaling="none", reset="none")
+        ars = dataclasses.replace(config.ars, param_resets=None, reward_scaling="none", reset="none")
         config = dataclasses.replace(config, ars=ars)
     return dataclasses.replace(config, evaluation=evaluation)
 

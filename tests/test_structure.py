@@ -92,11 +92,12 @@ def readme_examples():
         code = block.split("```")[0]
         for old, new in (
             ("20_000_000, progress_bar=True", "600"),
-            ("60_000, progress_bar=True", "600"),
+            ("48_000, progress_bar=True", "600"),
             ("make_metaworld_env", "make_toy_env"),
             ('"MT10", ', ""),
             ('verbose=1, tensorboard_log="runs"', 'batch_size=8, policy_kwargs={"net_arch": [8]}'),
             ("n_reset=4", "n_reset=1"),
+            ("param_resets=[12_000], batch_size=64", "param_resets=[300], batch_size=8"),
             ('model.save("mt10_ars")', ""),
             ("make_left_env", "PointTask"),
             ("make_right_env", "PointTask"),
