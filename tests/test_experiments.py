@@ -23,7 +23,7 @@ def tiny_toy(**algorithm):
         preset,
         algorithm=dataclasses.replace(preset.algorithm, **changes),
         evaluation=dataclasses.replace(preset.evaluation, n_episodes=2, every=400),
-        ars=dataclasses.replace(preset.ars, updates_after_reset=3),
+        ars=dataclasses.replace(preset.ars, param_resets=(400,), updates_after_reset=3),
         policy=dataclasses.replace(preset.policy, net_arch=(8,)),
     )
 
@@ -106,7 +106,7 @@ def test_a_run_leaves_a_complete_folder(algorithm, tmp_path, capsys):
 
 
 def test_a_second_run_gets_a_folder_of_its_own(tmp_path):
-    config = dataclasses.replace(tiny_toy(total_timesteps=400), output=tmp_path)
+    config = dataclasses.replace(tiny_toy(total_timesteps=600), output=tmp_path)
     assert [train(config, "toy", progress_bar=False).folder.name for _ in range(2)] == [
         "toy-seed0",
         "toy-seed0-2",
@@ -136,8 +136,8 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys):
         str(tmp_path),
         "--algorithm.total-timesteps",
         "800",
-        "--ars.n-reset",
-        "0",
+        "--ars.param-resets",
+        "400",
     ]
     assert (
         main([*arguments, "--policy.net-arch", "8", "8", "--evaluation.n-episodes", "1", "--seed", "3"]) == 0
@@ -182,7 +182,7 @@ def test_a_mistake_on_the_command_line_is_one_line_that_names_it(arguments, mess
 
 def test_an_option_the_method_refuses_is_refused_on_the_command_line_too(capsys):
     with pytest.raises(SystemExit) as exit_:
-        main(["train", "toy", "--ars.n-reset", "-1"])
+        main(["train", "mt10-ars", "--ars.n-reset", "-1"])
     assert exit_.value.code == 2
     assert "n_reset=-1 must be an integer of at least 0" in capsys.readouterr().err
 
