@@ -97,7 +97,7 @@ def readme_examples():
             ('"MT10", ', ""),
             ('verbose=1, tensorboard_log="runs"', 'batch_size=8, policy_kwargs={"net_arch": [8]}'),
             ("n_reset=4", "n_reset=1"),
-            ("param_resets=[12_000], batch_size=64", "param_resets=[300], batch_size=8"),
+            ("param_resets=[12_000]", "param_resets=[300]"),
             ('model.save("mt10_ars")', ""),
             ("make_left_env", "PointTask"),
             ("make_right_env", "PointTask"),
