@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     :param argv: arguments; ``None`` takes the process's
     """
+    # torch's OpenMP threads wait for work by spinning, which takes the cores from the environments' workers; this lets
+    # them sleep after some microseconds. Read when torch loads, so it stands before anything that imports it.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands: dict[str, Callable[[list[str]], int]] = {
         "train": _train,
