@@ -20,7 +20,8 @@ import torch as th
 
 from sb3_ars.evaluation import evaluate_tasks
 from sb3_ars.experiments.config import RunConfig, load_preset
-from sb3_ars.experiments.runner import build_model, make_env, protocol_of, run_versions
+from sb3_ars.experiments.runner import build_model, make_env, protocol_of
+from sb3_ars.versions import run_versions
 
 ARMS = ("ars", "sac")
 RESULTS = Path(__file__).parent / "results" / "toy_learning.json"

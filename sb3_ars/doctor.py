@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
-import platform
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import psutil
 import torch as th
+
+from sb3_ars.versions import available_cpus, run_versions
 
 __all__ = ["Check", "run_checks"]
 
@@ -45,35 +45,23 @@ def _guarded(check: Callable[[], Check]) -> Check:
 
 
 def _versions() -> Check:
-    packages = (
-        "sb3-ars",
-        "stable-baselines3",
-        "sb3-contrib",
-        "torch",
-        "gymnasium",
-        "metaworld",
-        "mujoco",
-        "numpy",
+    versions = run_versions()
+    packages = versions["packages"]
+    missing = [name for name, version in packages.items() if version is None]
+    text = ", ".join(
+        [f"python {versions['python']}", *(f"{n} {v}" for n, v in packages.items() if v is not None)]
     )
-    found, missing = [f"python {platform.python_version()}"], []
-    for name in packages:
-        try:
-            found.append(f"{name} {importlib.metadata.version(name)}")
-        except importlib.metadata.PackageNotFoundError:
-            missing.append(name)
-    text = ", ".join(found)
     if missing:
         text += f"; missing: {', '.join(missing)} (pip install {' '.join(missing)})"
     return Check("versions", not missing, text)
 
 
 def _processors() -> Check:
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     memory = psutil.virtual_memory().available / 1e9
     return Check(
         "processors",
         True,
-        f"{available} CPUs, {memory:.1f} GB of memory free, {th.get_num_threads()} torch threads",
+        f"{available_cpus()} CPUs, {memory:.1f} GB of memory free, {th.get_num_threads()} torch threads",
     )
 
 

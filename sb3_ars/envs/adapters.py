@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_ars.envs import checks
+from sb3_ars.envs.metaworld import task_names_of_classes
 from sb3_ars.envs.workers import REWARD_NORMALIZERS, EnvFacts
 from sb3_ars.errors import ConfigError, EnvContractError
 
@@ -479,8 +480,6 @@ def _names(peek: _Peek, task_of_env: npt.NDArray[np.int64], given: Sequence[str]
     classes = peek.values("task_name")  # each Meta-World env holds its class name
     if classes is None:
         return default
-    from sb3_ars.envs.metaworld import task_names_of_classes
-
     known = task_names_of_classes()
     of_env = [known.get(name) for name in classes]
     names = [of_env[int(np.argmax(task_of_env == task))] for task in range(n_tasks)]

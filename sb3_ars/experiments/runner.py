@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import json
-import platform
 import time
 from contextlib import closing
 from dataclasses import dataclass
@@ -13,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import psutil
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
@@ -35,21 +31,12 @@ from sb3_ars.evaluation import (
 )
 from sb3_ars.experiments.config import Activation, RunConfig, load_config, save_config
 from sb3_ars.experiments.plots import plot_training
+from sb3_ars.versions import run_versions
 
-__all__ = ["RunResult", "build_model", "evaluate_run", "final_table", "make_env", "run_versions", "train"]
+__all__ = ["RunResult", "build_model", "evaluate_run", "final_table", "make_env", "train"]
 
 _ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 _ALGORITHMS: dict[str, type[MultiTaskOffPolicyAlgorithm]] = {"ARSSAC": ARSSAC, "ARSTQC": ARSTQC}
-_VERSIONS_OF = (
-    "sb3-ars",
-    "stable-baselines3",
-    "sb3-contrib",
-    "torch",
-    "gymnasium",
-    "metaworld",
-    "mujoco",
-    "numpy",
-)
 
 
 @dataclass(frozen=True)
@@ -203,21 +190,6 @@ def final_table(evaluations: dict[bool, TaskEvaluation], reward_scale: list[floa
     return table
 
 
-def run_versions() -> dict[str, Any]:
-    """Return the versions and the hardware that numbers depend on."""
-    return {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "processor": platform.processor() or platform.machine(),
-        "cpus": len(psutil.Process().cpu_affinity())
-        if hasattr(psutil.Process, "cpu_affinity")
-        else psutil.cpu_count(),
-        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
-        "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
-        "packages": {name: _version(name) for name in _VERSIONS_OF},
-    }
-
-
 def env_names(model: MultiTaskOffPolicyAlgorithm) -> list[str]:
     """Return the task names of a multi-task model."""
     assert model.task_names is not None
@@ -322,10 +294,3 @@ def _task_list(tasks: str | tuple[str, ...]) -> str | list[str]:
 
 def _write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

@@ -1,0 +1,52 @@
+"""The versions and the hardware that numbers depend on."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from typing import Any
+
+import psutil
+import torch as th
+
+__all__ = ["PACKAGES", "available_cpus", "run_versions"]
+
+PACKAGES = (
+    "sb3-ars",
+    "stable-baselines3",
+    "sb3-contrib",
+    "torch",
+    "gymnasium",
+    "metaworld",
+    "mujoco",
+    "numpy",
+)
+
+
+def run_versions() -> dict[str, Any]:
+    """Return Python, platform, processors, memory (GB), GPU and package versions; ``None`` for what is missing."""
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cpus": available_cpus(),
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
+        "packages": {name: _version(name) for name in PACKAGES},
+    }
+
+
+def available_cpus() -> int:
+    """Return how many processors this process may use."""
+    return (
+        len(psutil.Process().cpu_affinity())
+        if hasattr(psutil.Process, "cpu_affinity")
+        else psutil.cpu_count() or 1
+    )
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
