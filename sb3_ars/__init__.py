@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sb3_ars.callbacks.evaluation import TaskEvalCallback
     from sb3_ars.config import ARSConfig
     from sb3_ars.envs import make_metaworld_env, make_multitask_env, make_toy_env
-    from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
+    from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, WorkerError
     from sb3_ars.evaluation import evaluate_tasks
 
 __version__ = "0.1.0"
@@ -32,6 +32,7 @@ _MODULE_OF = {
     "make_multitask_env": "envs",
     "make_toy_env": "envs",
     "ConfigError": "errors",
+    "DivergedError": "errors",
     "EnvContractError": "errors",
     "WorkerError": "errors",
     "evaluate_tasks": "evaluation",
@@ -43,6 +44,7 @@ __all__ = [
     "ARSCallback",
     "ARSConfig",
     "ConfigError",
+    "DivergedError",
     "EnvContractError",
     "TaskEvalCallback",
     "TaskReplayBuffer",

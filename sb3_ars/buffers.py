@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ars.core.reward_scale import RewardStatistics
-from sb3_ars.errors import ConfigError, EnvContractError
+from sb3_ars.errors import ConfigError, EnvContractError, check_count
 
 __all__ = ["TaskReplayBuffer"]
 
@@ -369,8 +369,4 @@ def _check_arguments(
             f"{len(task_names) - 1}, and each task at least one env."
         )
     per_task = max(list(task_of_env).count(task) for task in set(task_of_env))
-    if isinstance(buffer_size, bool) or not isinstance(buffer_size, int) or buffer_size < per_task:
-        raise ConfigError(
-            f"buffer_size={buffer_size!r} transitions per task must be an integer of at least {per_task}, "
-            "the number of envs a task has."
-        )
+    check_count("buffer_size", buffer_size, minimum=per_task)  # the envs of a task store at the same time

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
+from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, WorkerError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,9 +51,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if name not in commands:
             raise ConfigError(f"There is no command {name!r}; there are {', '.join(commands)}.")
         return commands[name](rest)
-    except (ConfigError, EnvContractError, WorkerError) as error:
+    except (ConfigError, DivergedError, EnvContractError, WorkerError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
 
 
 def _train(arguments: list[str]) -> int:

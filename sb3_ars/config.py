@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from sb3_ars.core.objectives import ActorValue
 from sb3_ars.core.reward_scale import parse_reward_scaling
-from sb3_ars.errors import ConfigError, nearest
+from sb3_ars.errors import ConfigError, check_count, nearest
 
 __all__ = ["ARSConfig", "ResetScope", "RewardScaling"]
 
@@ -25,7 +25,7 @@ class ARSConfig:
 
     n_reset: int | None = None
     """Number of resets, evenly spaced over the run; None is 4 with several tasks (the paper's MT10), 0 with one."""
-    param_resets: Sequence[int] | None = None
+    param_resets: list[int] | tuple[int, ...] | None = None
     """Environment steps at which to reset, instead of n_reset (SBX's name)."""
     reward_scaling: RewardScaling | None = "mean"
     """"mean" (Eq. 6), "std", "normalization" (Table 5), "none", one number, or one per task (list or {name: c})."""
@@ -35,17 +35,18 @@ class ARSConfig:
     """What a reset renews: "actor_critic" (temperatures too), "critic", or "none"."""
     updates_after_reset: int = 1000
     """Gradient steps on the kept buffers right after a reset."""
-    actor_value: ActorValue = "min"
-    """Critics the actor's loss reads: "min" (SB3) or "first" (the authors' code)."""
+    actor_value: ActorValue = "all"
+    """Critics the actor's loss reads: "all" (SB3's reduction) or "first" (the authors' code)."""
 
     def __post_init__(self) -> None:
         if self.n_reset is not None:
-            _check_integer("n_reset", self.n_reset, minimum=0)
+            check_count("n_reset", self.n_reset, minimum=0)
         if self.n_reset is not None and self.param_resets is not None:
             raise ConfigError(
-                f"n_reset={self.n_reset} and param_resets={list(self.param_resets)} both say when to reset; give one."
+                f"n_reset={self.n_reset} and param_resets={list(self.param_resets)} both say when to reset; "
+                "give one and set the other to None."
             )
-        _check_integer("updates_after_reset", self.updates_after_reset, minimum=0)
+        check_count("updates_after_reset", self.updates_after_reset, minimum=0)
         _check_positive("reward_floor", self.reward_floor)
         _check_choice("reset", self.reset, (*get_args(ResetScope), None))
         _check_choice("actor_value", self.actor_value, get_args(ActorValue))
@@ -76,11 +77,6 @@ class ARSConfig:
         return [total_timesteps * (k + 1) // (n_reset + 1) for k in range(n_reset)]
 
 
-def _check_integer(option: str, value: object, minimum: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
-        raise ConfigError(f"{option}={value!r} must be an integer of at least {minimum}.")
-
-
 def _check_positive(option: str, value: object) -> None:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (is_number and 0 < value < float("inf")):  # type: ignore[operator]  # checked on the line above
@@ -99,6 +95,6 @@ def _check_param_resets(param_resets: object) -> None:
     if isinstance(param_resets, str) or not isinstance(param_resets, Sequence):
         raise ConfigError(f"param_resets={param_resets!r} must be a list of environment steps.")
     for step in param_resets:
-        _check_integer("param_resets entry", step, minimum=1)
+        check_count("param_resets entry", step, minimum=1)
     if list(param_resets) != sorted(set(param_resets)):
         raise ConfigError(f"param_resets={list(param_resets)} must increase from entry to entry.")

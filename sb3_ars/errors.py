@@ -7,12 +7,19 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
-__all__ = ["ConfigError", "EnvContractError", "WorkerError", "nearest"]
+import numpy as np
+
+__all__ = ["ConfigError", "DivergedError", "EnvContractError", "WorkerError", "check_count", "nearest"]
 
 
 class ConfigError(ValueError):
     """An option, or a combination of options, that cannot work; raised before time is spent."""
+
+
+class DivergedError(RuntimeError):
+    """Training produced NaN or infinity in its losses; the networks are lost, what was saved before is not."""
 
 
 class EnvContractError(RuntimeError):
@@ -31,3 +38,16 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """
     matches = difflib.get_close_matches(name, list(valid), n=1)
     return f" Did you mean {matches[0]!r}?" if matches else ""
+
+
+def check_count(option: str, value: Any, minimum: int = 1) -> int:
+    """Return ``value`` as an int if it is an integer of at least ``minimum``; a bool is none.
+
+    :param option: what the message calls it
+    :param value: what was given
+    :param minimum: smallest value allowed
+    :raises ConfigError: otherwise
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise ConfigError(f"{option}={value!r} must be an integer of at least {minimum}.")
+    return int(value)

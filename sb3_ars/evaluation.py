@@ -17,11 +17,13 @@ from tqdm.auto import tqdm
 from sb3_ars.envs import make_metaworld_env
 from sb3_ars.envs.metaworld import Goals
 from sb3_ars.errors import ConfigError, nearest
+from sb3_ars.metrics import mean_success, success_rates
 
 __all__ = [
     "PROTOCOLS",
     "EvaluationProtocol",
     "TaskEvaluation",
+    "check_evaluation_env",
     "evaluate_tasks",
     "get_protocol",
     "make_evaluation_env",
@@ -90,13 +92,12 @@ class TaskEvaluation:
     @property
     def success(self) -> Array:
         """``(n_tasks,)`` success rates, at least once, in [0, 1]."""
-        rates: Array = self.success_once.mean(axis=1)
-        return rates
+        return success_rates(self.success_once)
 
     @property
     def mean_success(self) -> float:
-        """Mean over tasks of the success rates."""
-        return float(self.success.mean())
+        """Mean success rate of the tasks that report success, NaN if none does."""
+        return mean_success(self.success)
 
     def table(self) -> pd.DataFrame:
         """Return one row per task: success, success at the end, return, length."""
@@ -185,7 +186,15 @@ def _evaluate(
     seed: int,
     progress_bar: bool,
 ) -> TaskEvaluation:
-    task_names, task_of_env = _check_env(model, env, protocol)
+    check_evaluation_env(model, env, protocol)
+    tasks: Any = env
+    task_names, task_of_env = list(tasks.task_names), np.asarray(tasks.task_of_env)
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is not None:
+        normalizer.training = False
+        training_env: Any = getattr(model, "env", None)
+        if training_env is not None:
+            sync_envs_normalization(training_env, env)
     wanted = _episodes_of_env(task_of_env, len(task_names), protocol.n_episodes)
     episodes: list[list[dict[str, float]]] = [[] for _ in range(env.num_envs)]
     env.seed(seed)
@@ -222,9 +231,14 @@ def _outcome(info: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _check_env(
-    model: Policy, env: VecEnv, protocol: EvaluationProtocol
-) -> tuple[list[str], npt.NDArray[np.int64]]:
+def check_evaluation_env(model: Any, env: VecEnv, protocol: EvaluationProtocol) -> None:
+    """Raise if the environment is not one to evaluate this model on under this protocol.
+
+    :param model: trained model
+    :param env: evaluation environment
+    :param protocol: its horizon and goals must be the environment's
+    :raises ConfigError: naming what does not fit and the remedy
+    """
     training_env: Any = getattr(model, "env", None)
     if training_env is not None and env.unwrapped is training_env.unwrapped:
         raise ConfigError(
@@ -235,26 +249,38 @@ def _check_env(
         raise ConfigError(
             "The evaluation environment has no tasks; make it with make_metaworld_env or make_multitask_env."
         )
-    tasks: Any = env  # SB3's VecEnv, or a wrapper of it, with our attributes
-    names = list(tasks.task_names)
     trained_on = getattr(model, "task_names", None)
-    if trained_on is not None and list(trained_on) != names:
+    if trained_on is not None and list(trained_on) != list(env.task_names):
         raise ConfigError(
-            f"The model was trained on {list(trained_on)}, but the evaluation environment has {names}."
+            f"The model was trained on {list(trained_on)}, but the evaluation environment has {list(env.task_names)}."
         )
+    if training_env is not None:
+        normalized = [unwrap_vec_normalize(e) is not None for e in (training_env, env)]
+        if normalized[0] != normalized[1]:
+            raise ConfigError(
+                f"Observations were {'' if normalized[0] else 'not '}normalised in training; wrap the evaluation "
+                f"environment in VecNormalize(norm_reward=False) {'too' if normalized[0] else 'in neither or both'}."
+            )
+    _check_protocol(env, protocol)
+
+
+def _check_protocol(env: Any, protocol: EvaluationProtocol) -> None:
+    """Raise if the protocol's words would not be true of the environment."""
     horizon = getattr(env, "max_episode_steps", None)
     if protocol.max_episode_steps is not None and horizon not in (None, protocol.max_episode_steps):
         raise ConfigError(
             f"{protocol.describe()}, but the environment's max_episode_steps is {horizon}. Make it with "
-            f"max_episode_steps={protocol.max_episode_steps}, or evaluate under "
-            f"EvaluationProtocol(name, max_episode_steps=None)."
+            f"max_episode_steps={protocol.max_episode_steps}, or evaluate under protocol 'env', which takes the "
+            "environment's own."
         )
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is not None:
-        normalizer.training = False
-        if training_env is not None:
-            sync_envs_normalization(training_env, env)
-    return names, np.asarray(tasks.task_of_env)
+    goals, n_goals = getattr(env, "goals", None), getattr(env, "n_goals", None)
+    enough = protocol.goals != "ordered" or (n_goals or 0) >= protocol.n_episodes
+    if protocol.goals is not None and (goals != protocol.goals or not enough):
+        raise ConfigError(
+            f"{protocol.describe()}, but the environment has {goals or 'its own'} goals"
+            f"{f', {n_goals} of them' if goals else ''}. Make it with make_evaluation_env(tasks, protocol), or "
+            "evaluate under protocol 'env'."
+        )
 
 
 def _episodes_of_env(

@@ -10,7 +10,7 @@ from scipy import stats
 
 from sb3_ars.errors import ConfigError
 
-__all__ = ["Interval", "bottom_k", "estr", "iqm", "iqm_interval"]
+__all__ = ["Interval", "bottom_k", "estr", "iqm", "iqm_interval", "mean_success", "success_rates"]
 
 Array = npt.NDArray[np.float64]
 
@@ -23,6 +23,25 @@ class Interval(NamedTuple):
     high: float
 
 
+def success_rates(episodes: npt.ArrayLike) -> Array:
+    """Return each task's share of successful episodes, ``(n_tasks,)`` in [0, 1].
+
+    :param episodes: ``(n_tasks, n_episodes)``, 1 or 0 for each episode; NaN for a task that reports no success
+    """
+    rates: Array = np.asarray(episodes, dtype=np.float64).mean(axis=1)
+    return rates
+
+
+def mean_success(success: npt.ArrayLike) -> float:
+    """Return the mean over the tasks that report success, NaN if none does.
+
+    :param success: ``(n_tasks,)`` success rates in [0, 1], NaN for a task that reports none
+    """
+    rates = np.asarray(success, dtype=np.float64)
+    reported = rates[~np.isnan(rates)]
+    return float(reported.mean()) if reported.size else float("nan")
+
+
 def bottom_k(success: npt.ArrayLike, k: int) -> float:
     """Return the mean success over the k tasks with the lowest success.
 
@@ -33,8 +52,8 @@ def bottom_k(success: npt.ArrayLike, k: int) -> float:
     Source: paper, section 5.1, Table 2.
     """
     rates = _checked("success", success, ndim=1)
-    if not 1 <= k <= rates.size:
-        raise ConfigError(f"k={k} must be between 1 and the number of tasks, {rates.size}.")
+    if k != int(k) or not 1 <= k <= rates.size:
+        raise ConfigError(f"k={k!r} must be an integer between 1 and the number of tasks, {rates.size}.")
     return float(np.sort(rates)[:k].mean())
 
 
@@ -47,6 +66,8 @@ def estr(success: npt.ArrayLike, threshold: float) -> float:
 
     Source: paper, section 5.1, Eq. 8.
     """
+    if not 0 <= threshold <= 1:
+        raise ConfigError(f"threshold={threshold!r} must be between 0 and 1.")
     return float((_checked("success", success, ndim=1) >= threshold).mean())
 
 
@@ -76,6 +97,8 @@ def iqm_interval(
 
     Source: Agarwal et al. 2021, section 4.1.
     """
+    if not 0 < confidence < 1:
+        raise ConfigError(f"confidence={confidence!r} must be between 0 and 1, such as 0.95.")
     table = _checked("scores", scores, ndim=2)
     if table.shape[0] < 2:
         raise ConfigError(

@@ -1,10 +1,12 @@
 """Several tasks in one model: scale, resets, schedule, logging, saving; on the toy tasks."""
 
+import pickle
 import warnings
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_ars import (
@@ -12,6 +14,7 @@ from sb3_ars import (
     ARSTQC,
     ARSCallback,
     ConfigError,
+    DivergedError,
     EnvContractError,
     make_multitask_env,
     make_toy_env,
@@ -65,6 +68,73 @@ def test_param_resets_set_the_times():
     recorder = Recorder()
     toy_model(param_resets=[300, 700]).learn(1000, callback=recorder)
     assert recorder.resets == [300, 700]
+
+
+@BOTH
+def test_continuing_a_finished_run_does_not_reset_it(algorithm):
+    model = toy_model(algorithm, n_reset=4).learn(1000)
+    assert model.n_resets == 4
+    before = [p.detach().clone() for p in model.actor.parameters()]
+    model.gradient_steps = 0
+    model.learn(8, reset_num_timesteps=False)  # the times of 1,008 steps all lie in the past
+    assert model.n_resets == 4
+    assert all(th.equal(p, q) for p, q in zip(before, model.actor.parameters(), strict=True))
+
+
+def test_another_scaling_given_to_a_loaded_model_acts_before_the_next_reset(tmp_path):
+    toy_model(n_reset=0).learn(400).save(tmp_path / "model")
+    model = ARSSAC.load(tmp_path / "model", env=make_toy_env(seed=0), reward_scaling=[1, 2, 3, 4])
+    with pytest.warns(UserWarning, match="Updates wait"):
+        model.learn(100, reset_num_timesteps=False)
+    assert model.reward_scale.scale.tolist() == [1, 2, 3, 4]
+
+
+def test_a_mean_that_turns_negative_keeps_the_scales_and_the_run():
+    class Souring(PointTask):
+        total = 0
+
+        def step(self, action):
+            obs, reward, *rest = super().step(action)
+            Souring.total += 1
+            return obs, reward if Souring.total < 100 else -50.0, *rest
+
+    env = make_multitask_env({"good": PointTask, "sour": Souring}, seed=0, n_workers=0)
+    model = ARSSAC("MlpPolicy", env, n_reset=1, **SMALL)
+    with pytest.warns(UserWarning, match="scales stay as they were.*sour"):
+        model.learn(400)
+    assert model.n_resets == 1 and len(model.reward_scale_history) == 1
+
+
+def test_losses_that_are_not_finite_stop_training():
+    model = toy_model(n_reset=0).learn(100)
+    with th.no_grad():
+        model.critic.qf0[0].weight[0, 0] = float("nan")
+    with pytest.raises(DivergedError, match="NaN or infini"):
+        model.learn(400, reset_num_timesteps=False)
+
+
+def test_a_model_of_another_algorithm_is_refused(tmp_path):
+    toy_model(ARSTQC).save(tmp_path / "tqc")
+    with pytest.raises(ConfigError, match="ARSTQCPolicy is not one of ARSSAC's"):
+        ARSSAC.load(tmp_path / "tqc")
+    SAC("MlpPolicy", "Pendulum-v1").save(tmp_path / "sac")
+    with pytest.raises(ConfigError, match="SACPolicy is not one of ARSSAC's"):
+        ARSSAC.load(tmp_path / "sac")
+
+
+def test_a_file_that_is_no_buffer_leaves_the_models_own(tmp_path):
+    model = toy_model()
+    kept = model.replay_buffer
+    (tmp_path / "buffer.pkl").write_bytes(pickle.dumps({"not": "a buffer"}))
+    with pytest.raises(AssertionError):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.replay_buffer is kept
+
+
+def test_a_garbage_file_is_refused_by_name(tmp_path):
+    (tmp_path / "model.zip").write_text("garbage")
+    with pytest.raises(ConfigError, match="is not a saved model"):
+        ARSSAC.load(tmp_path / "model.zip", env=make_toy_env())
 
 
 def test_reset_times_follow_the_whole_run_when_it_is_learned_in_pieces():
@@ -179,7 +249,11 @@ def test_scales_and_schedule_survive_saving(algorithm, tmp_path):
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", env=make_toy_env(seed=0))
     assert th.equal(loaded.reward_scale.scale, model.reward_scale.scale)
-    assert loaded.n_resets == 3 and loaded.last_reset_at == model.last_reset_at and loaded.reward_scale_is_set
+    assert (
+        loaded.n_resets == 3
+        and loaded.resets_looked_for_until == model.resets_looked_for_until
+        and loaded.scaled_by == "'mean'"
+    )
     assert loaded.task_names == ["point-east", "point-north", "point-west", "point-south"]
     assert th.equal(loaded.log_ent_coef, model.log_ent_coef)
     obs = model.env.reset()
@@ -206,8 +280,11 @@ def test_predict_takes_a_task_for_observations_without_the_id():
     expected, _ = model.predict(obs, deterministic=True)
     for task in ("point-west", 2):
         assert np.array_equal(model.predict(obs[:6], deterministic=True, task=task)[0], expected)
-    with pytest.raises(ConfigError, match="point-west"):
-        model.predict(obs[:6], task="point-wset")
+    for wrong in ("point-wset", 7, 1.5):
+        with pytest.raises(ConfigError, match="point-west"):
+            model.predict(obs[:6], task=wrong)
+    with pytest.raises(ConfigError, match="lacks the one-hot task id"):
+        model.predict(obs[:6])
 
 
 def test_the_same_seed_gives_the_same_model():
@@ -265,7 +342,7 @@ def test_negative_mean_rewards_stop_before_the_first_update():
 
     env = make_multitask_env({"good": PointTask, "sad": Negative}, seed=0, n_workers=0)
     model = ARSSAC("MlpPolicy", env, n_reset=0, **SMALL)
-    with pytest.raises(ConfigError, match=r"negative: sad \(-1\)"):
+    with pytest.raises(ConfigError, match=r"not positive: sad \(-1\)"):
         model.learn(200)
     assert model._n_updates == 0 and model.replay_buffer.size() > 0
 
@@ -292,6 +369,13 @@ BAD_OPTIONS = [
     ({"batch_size": 3000}, "batch_size=3000 rows per task is more than buffer_size=2000"),
     ({"buffer_size": 0}, "buffer_size=0"),
     ({"use_sde": True}, "use_sde"),
+    ({"gamma": 2}, "gamma=2"),
+    ({"tau": -0.1}, "tau=-0.1"),
+    ({"ent_coef": "atuo"}, "ent_coef='atuo'"),
+    ({"ent_coef": -1}, "ent_coef=-1"),
+    ({"target_update_interval": 0}, "target_update_interval=0"),
+    ({"stats_window_size": 0}, "stats_window_size=0"),
+    ({"learning_rate": -1}, "learning_rate=-1"),
     ({"n_steps": 3}, "n_steps=3"),
     ({"optimize_memory_usage": True}, "optimize_memory_usage"),
     ({"policy_kwargs": {"std": "sigmoid"}}, "std='sigmoid'"),
@@ -321,6 +405,18 @@ def test_an_option_that_does_not_fit_the_run_is_refused_before_its_first_step(op
     with pytest.raises(ConfigError, match=message):
         model.learn(400)
     assert model.num_timesteps == 0
+
+
+@pytest.mark.parametrize("total", ["100", None, -5, float("nan"), True])
+def test_a_total_that_is_no_number_of_steps_is_refused(total):
+    with pytest.raises(ConfigError, match="total_timesteps"):
+        toy_model(n_reset=0).learn(total)
+
+
+@pytest.mark.parametrize("n_drop", [25, 30, -1, 1.5])
+def test_dropping_all_quantiles_is_refused(n_drop):
+    with pytest.raises(ConfigError, match="top_quantiles_to_drop_per_net"):
+        toy_model(ARSTQC, top_quantiles_to_drop_per_net=n_drop)
 
 
 class Stop(BaseCallback):

@@ -100,6 +100,11 @@ def test_means_without_a_positive_meaning_are_refused_by_task_name(mean, named):
         scale_of("mean", statistics(mean, names=["reach", "push"]))
 
 
+def test_a_floor_above_every_mean_is_refused():
+    with pytest.raises(ConfigError, match=r"reward_floor=0\.01"):
+        scale_of("mean", statistics([1e-3, 1e-5]))
+
+
 def test_constant_rewards_are_refused_for_standard_deviation():
     with pytest.raises(ConfigError, match="push"):
         scale_of("std", statistics([1.0, 1.0], std=[1.0, 0.0], names=["reach", "push"]))

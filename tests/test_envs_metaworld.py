@@ -179,8 +179,11 @@ def test_names_come_in_meta_world_s_order_with_or_without_version():
             "goals must be one of 'random', 'stored', 'ordered'",
         ),
         (lambda: make_metaworld_env("reach", reward_version="v3"), "reward_version must be one of"),
-        (lambda: make_metaworld_env("reach", max_episode_steps=0), "max_episode_steps must be .* at least 1"),
-        (lambda: make_metaworld_env("reach", n_goals=0), "n_goals must be"),
+        (
+            lambda: make_metaworld_env("reach", max_episode_steps=0),
+            "max_episode_steps=.* must be .* at least 1",
+        ),
+        (lambda: make_metaworld_env("reach", n_goals=0), "n_goals=.* must be"),
         (lambda: make_metaworld_env("reach", goal_seed=-1), "goal_seed must be"),
         (lambda: make_metaworld_env("reach", goal_seed=None), "goal_seed must be"),
         (lambda: make_metaworld_env("reach", goal_seed=2**32), "goal_seed must be"),

@@ -219,12 +219,19 @@ def test_an_exception_in_a_worker_arrives_with_its_task_and_traceback():
     assert children_are_gone(pids)
 
 
-def test_an_exception_in_process_is_the_env_s_own():
+def test_an_exception_in_process_names_the_task_and_keeps_its_cause():
     env = build("raise", n_workers=0)
     env.reset()
-    with pytest.raises(KeyError, match="gripper"):
+    with pytest.raises(WorkerError, match=r"'wild' raised KeyError while stepping.*gripper") as caught:
         for _ in range(3):
             env.step(np.zeros((2, 2)))
+    assert isinstance(caught.value.__cause__, KeyError)
+
+
+def test_one_env_returned_twice_is_refused():
+    shared = Small()
+    with pytest.raises(ConfigError, match="'b' returned an env that is in use already"):
+        MultiTaskVecEnv({"a": lambda: shared, "b": lambda: shared}, n_workers=0)
 
 
 @pytest.mark.parametrize("n_workers", [0, 2])

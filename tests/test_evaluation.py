@@ -132,7 +132,7 @@ def test_the_callback_keeps_the_best_model_by_mean_success_and_every_evaluation(
     assert saved == [
         ("best_model", 100),
         ("best_model", 200),
-    ] and callback.best_mean_success == pytest.approx(0.8)
+    ] and callback.best_score == pytest.approx(0.8)
     with np.load(tmp_path / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == [100, 200, 300]
         assert evaluations["successes"].shape == evaluations["results"].shape == (3, 4, 3)
@@ -155,6 +155,26 @@ def test_evaluation_does_not_change_training():
     callback = TaskEvalCallback(make_toy_env(seed=1), 100, SHORT, deterministic=False)
     assert all(th.equal(a, b) for a, b in zip(weights(None), weights(callback), strict=True))
     assert len(callback.history) == 3
+
+
+def test_statistics_of_observations_in_training_or_evaluation_alone_are_refused():
+    model = ARSSAC(
+        "MlpPolicy", VecNormalize(make_toy_env(seed=0), norm_reward=False), policy_kwargs={"net_arch": [8]}
+    )
+    with pytest.raises(ConfigError, match="normalised in training"):
+        evaluate_tasks(model, make_toy_env(), "env")
+
+
+def test_a_protocol_whose_goals_the_env_does_not_have_is_refused():
+    with pytest.raises(ConfigError, match="environment has its own goals"):
+        evaluate_tasks(Still(), make_toy_env(max_episode_steps=500), "paper")
+
+
+def test_the_callback_checks_its_environment_before_training():
+    model = ARSSAC("MlpPolicy", make_toy_env(seed=0), policy_kwargs={"net_arch": [8]}, n_reset=0)
+    with pytest.raises(ConfigError, match="max_episode_steps is 50"):
+        model.learn(1000, callback=TaskEvalCallback(make_toy_env(), 500))
+    assert model.num_timesteps == 0
 
 
 @pytest.mark.parametrize("eval_freq", [0, -1, 2.5, True])

@@ -7,10 +7,12 @@ import sys
 
 import pandas as pd
 import pytest
+import torch as th
 import yaml
 
+from sb3_ars import ARSSAC
 from sb3_ars.cli import main
-from sb3_ars.errors import ConfigError
+from sb3_ars.errors import ConfigError, WorkerError
 from sb3_ars.experiments import preset_names
 from sb3_ars.experiments.config import RunConfig, load_config, load_preset, save_config
 from sb3_ars.experiments.runner import build_model, protocol_of, train
@@ -113,19 +115,67 @@ def test_a_second_run_gets_a_folder_of_its_own(tmp_path):
     ]
 
 
+def stopped_by(error, at, monkeypatch):
+    """Make training raise once it has come to a step."""
+    original = ARSSAC.train
+
+    def train_until(self, *args, **kwargs):
+        if self.num_timesteps >= at:
+            raise error
+        original(self, *args, **kwargs)
+
+    monkeypatch.setattr(ARSSAC, "train", train_until)
+
+
 def test_an_interrupted_run_is_kept(tmp_path, monkeypatch):
-    from sb3_ars import ARSSAC
+    stopped_by(KeyboardInterrupt(), 500, monkeypatch)
+    folder = train(dataclasses.replace(tiny_toy(), output=tmp_path), "toy", progress_bar=False).folder
+    summary = json.loads((folder / "result.json").read_text())
+    assert summary["interrupted"] and summary["timesteps"] == 500 and (folder / "policy.zip").is_file()
 
-    def interrupted(self, *args, **kwargs):
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr(ARSSAC, "learn", interrupted)
-    config = dataclasses.replace(tiny_toy(), output=tmp_path)
-    monkeypatch.setattr("sb3_ars.experiments.runner.plot_training", lambda *a: None)
-    folder = train(config, "toy", progress_bar=False).folder
-    assert (
-        json.loads((folder / "result.json").read_text())["interrupted"] and (folder / "policy.zip").is_file()
+def test_a_run_that_fails_keeps_what_was_learned(tmp_path, monkeypatch, capsys):
+    stopped_by(WorkerError("the env died"), 500, monkeypatch)
+    with pytest.raises(WorkerError):
+        train(dataclasses.replace(tiny_toy(), output=tmp_path), "toy", progress_bar=False)
+    assert "failed at step 500" in capsys.readouterr().out
+    assert ARSSAC.load(tmp_path / "toy-seed0" / "policy.zip").num_timesteps == 500
+
+
+def test_a_run_that_never_began_leaves_no_folder(tmp_path):
+    config = tiny_toy()
+    config = dataclasses.replace(
+        config, output=tmp_path, ars=dataclasses.replace(config.ars, param_resets=(5,))
     )
+    with pytest.raises(ConfigError, match="param_resets"):
+        train(config, "toy", progress_bar=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_has_readable_help(name, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", name, "--help"])
+    assert exit_.value.code == 0 and "--ars.reward-scaling" in capsys.readouterr().out
+
+
+def test_broken_run_folders_are_refused_by_name(tmp_path, capsys):
+    (tmp_path / "config.yaml").write_text("env: [")
+    assert main(["evaluate", str(tmp_path)]) == 2 and "not valid YAML" in capsys.readouterr().err
+    (tmp_path / "config.yaml").write_text("env: 3")
+    assert main(["evaluate", str(tmp_path)]) == 2 and "must be a mapping" in capsys.readouterr().err
+    save_config(tiny_toy(), tmp_path / "config.yaml")
+    assert main(["evaluate", str(tmp_path)]) == 2 and "policy.zip" in capsys.readouterr().err
+    (tmp_path / "policy.zip").write_text("no zip")
+    assert main(["evaluate", str(tmp_path)]) == 2 and "cannot be read as ARSSAC" in capsys.readouterr().err
+    assert main(["evaluate", str(tmp_path), "--n-episodes", "0"]) == 2
+    assert "n_episodes=0" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_missing_gpu_is_refused_not_replaced(capsys):
+    assert main(["train", "toy", "--algorithm.device", "cuda"]) == 2
+    assert "torch finds no GPU" in capsys.readouterr().err
 
 
 def test_the_command_trains_and_evaluates(tmp_path, capsys):
@@ -208,4 +258,4 @@ def test_a_configuration_reaches_the_model():
     )
     model = build_model(config, make_toy_env(seed=0))
     assert type(model.critic.qf0[0]).__name__ == "LayerNorm" and model.policy.std == "softplus"
-    assert model.actor.optimizer.defaults["fused"] and model.batch_size == 100 and model.actor_value == "min"
+    assert model.actor.optimizer.defaults["fused"] and model.batch_size == 100 and model.actor_value == "all"

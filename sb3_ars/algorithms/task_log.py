@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 
 from sb3_ars.core.update import Metrics
+from sb3_ars.errors import DivergedError
 
 __all__ = ["TaskLog", "log_names"]
 
@@ -53,6 +54,7 @@ class TaskLog:
         :param logger: SB3's
         :param n_updates: gradient steps of the whole run
         :param temperature_is_learned: whether there is a temperature loss to report
+        :raises DivergedError: if a loss is NaN or infinite
         """
         for key, values in self._episode_means().items():
             self._record_tasks(logger, key, values)
@@ -63,6 +65,11 @@ class TaskLog:
         actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value = (
             (tensor / self._n_updates).tolist() for tensor in self._sums
         )
+        if not np.isfinite([actor_loss, critic_loss]).all():
+            raise DivergedError(
+                f"The losses became NaN or infinite by update {n_updates} (actor {actor_loss}, critic {critic_loss}). "
+                "Continue from an earlier save with a smaller learning_rate or smaller rewards."
+            )
         logger.record("train/n_updates", n_updates, exclude="tensorboard")
         logger.record("train/ent_coef", float(np.mean(ent_coef)))
         logger.record("train/actor_loss", actor_loss)

@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.core.objectives import Objective, TQCObjective
+from sb3_ars.errors import ConfigError, check_count
 from sb3_ars.policies import ARSTQCPolicy, TQCCnnPolicy, TQCMultiInputPolicy
 
 __all__ = ["ARSTQC"]
@@ -41,6 +42,14 @@ class ARSTQC(MultiTaskOffPolicyAlgorithm, TQC):
         self.top_quantiles_to_drop_per_net = top_quantiles_to_drop_per_net
         if _init_setup_model:
             self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        n_quantiles, n_drop = self.critic.n_quantiles, self.top_quantiles_to_drop_per_net
+        if check_count("top_quantiles_to_drop_per_net", n_drop, minimum=0) >= n_quantiles:
+            raise ConfigError(
+                f"top_quantiles_to_drop_per_net={n_drop} must be less than n_quantiles={n_quantiles}"
+            )
 
     def _make_objective(self) -> Objective:
         n_drop = self.top_quantiles_to_drop_per_net * self.critic.n_critics

@@ -40,7 +40,10 @@ class ARSCallback(BaseCallback):
         model = self.algorithm
         self.verbose = max(self.verbose, model.verbose)
         if model.num_timesteps == 0:
-            model.last_reset_at = 0
+            model.resets_looked_for_until = 0
+            model.reward_scale_history = model.reward_scale_history[-1:] and [
+                (0, model.reward_scale_history[-1][1])
+            ]
         self.reset_times = model.config.reset_times(model._total_timesteps, model.n_tasks)
         self._check_reset_times()
 
@@ -63,12 +66,22 @@ class ARSCallback(BaseCallback):
             )
 
     def _on_rollout_start(self) -> None:
-        if self.reset_is_due():
+        model = self.algorithm
+        due = self.reset_is_due()
+        model.resets_looked_for_until = model.num_timesteps
+        if due and not model.has_batch():
+            warnings.warn(
+                f"The reset due at step {model.num_timesteps} is left out: without the replay buffer, fresh networks "
+                "would have nothing to learn from. Load it with load_replay_buffer.",
+                stacklevel=2,
+            )
+        elif due:
             self.reset()
 
     def _on_rollout_end(self) -> None:
         model = self.algorithm
-        if not model.reward_scale_is_set and model.num_timesteps > model.learning_starts:
+        has_scale = model.scaled_by == repr(model.reward_scaling)
+        if not has_scale and model.num_timesteps > model.learning_starts and model.has_batch():
             model.update_reward_scale()  # Algorithm 1, line 8
             self._print_scale("after the random phase")
 
@@ -76,20 +89,23 @@ class ARSCallback(BaseCallback):
         return True
 
     def reset_is_due(self) -> bool:
-        """Return whether a reset time has come since the last reset."""
+        """Return whether a reset time has come since this was last asked.
+
+        Times that passed unasked are left: a run continued over a longer total has its times spaced anew, and some
+        of them may lie in its past.
+        """
         model = self.algorithm
-        return any(model.last_reset_at < time <= model.num_timesteps for time in self.reset_times)
+        return any(model.resets_looked_for_until < time <= model.num_timesteps for time in self.reset_times)
 
     def reset(self) -> None:
         """Recompute c_i, reset the networks, do the extra updates (Algorithm 1, lines 14 to 17)."""
         model = self.algorithm
-        if (
-            model.has_batch()
-        ):  # otherwise the run was resumed without its buffer, and the scale it had is the best there is
+        try:
             model.update_reward_scale()
+        except ConfigError as error:  # a day of training is not thrown away because a mean turned negative
+            warnings.warn(f"The reward scales stay as they were. {error}", stacklevel=2)
         model.reset_networks()
-        model.last_reset_at = model.num_timesteps
-        self._print_scale(f"reset {model.n_resets} of {len(self.reset_times)}")
+        self._print_scale(f"reset {model.n_resets}")
         if model.updates_after_reset > 0:
             model.train(gradient_steps=model.updates_after_reset, batch_size=model.batch_size)
 

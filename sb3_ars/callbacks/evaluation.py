@@ -9,14 +9,22 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_ars.errors import ConfigError
-from sb3_ars.evaluation import EvaluationProtocol, TaskEvaluation, evaluate_tasks, get_protocol
+from sb3_ars.errors import check_count
+from sb3_ars.evaluation import (
+    EvaluationProtocol,
+    TaskEvaluation,
+    check_evaluation_env,
+    evaluate_tasks,
+    get_protocol,
+)
 
 __all__ = ["TaskEvalCallback"]
 
 
 class TaskEvalCallback(EventCallback):
     """Evaluate every ``eval_freq`` environment steps; log per task; keep the best model by mean success over tasks.
+
+    Where no task reports success, the best model is the one with the highest mean return.
 
     SB3's ``EvalCallback`` picks the best model by mean reward, which the loudest task decides.
 
@@ -45,20 +53,19 @@ class TaskEvalCallback(EventCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(callback_after_eval, verbose=verbose)
-        if isinstance(eval_freq, bool) or not isinstance(eval_freq, int) or eval_freq < 1:
-            raise ConfigError(f"eval_freq={eval_freq!r} must be a positive number of environment steps.")
         self.eval_env = eval_env
-        self.eval_freq = eval_freq
+        self.eval_freq = check_count("eval_freq", eval_freq)
         self.protocol = get_protocol(protocol)
         self.deterministic = deterministic
         self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
         self.log_path = None if log_path is None else Path(log_path)
         self.callback_on_new_best = callback_on_new_best
-        self.best_mean_success = -np.inf
+        self.best_score = -np.inf
         self.history: list[tuple[int, TaskEvaluation]] = []
         self._next_at = eval_freq
 
     def _init_callback(self) -> None:
+        check_evaluation_env(self.model, self.eval_env, self.protocol)  # now, not hours later
         for folder in (self.best_model_save_path, self.log_path):
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -77,8 +84,11 @@ class TaskEvalCallback(EventCallback):
         self.history.append((self.num_timesteps, result))
         self._record(result)
         keep_on = True
-        if result.mean_success > self.best_mean_success:
-            self.best_mean_success = result.mean_success
+        score = result.mean_success
+        if np.isnan(score):  # no task reports success
+            score = float(result.returns.mean())
+        if score > self.best_score:
+            self.best_score = score
             if self.best_model_save_path is not None:
                 self.model.save(self.best_model_save_path / "best_model")
             if self.callback_on_new_best is not None:

@@ -12,8 +12,8 @@ import torch as th
 
 __all__ = ["ActorValue", "Objective", "SACObjective", "TQCObjective", "quantile_huber_loss"]
 
-ActorValue = Literal["min", "first"]
-"""Which critics the actor's loss reads: SB3's reduction over all of them, or the first alone."""
+ActorValue = Literal["all", "first"]
+"""Which critics the actor's loss reads: all, reduced as SB3 and sb3-contrib do, or the first alone."""
 
 
 class Objective(Protocol):
@@ -37,12 +37,12 @@ class Objective(Protocol):
 class SACObjective:
     """Clipped double Q-learning.
 
-    :param actor_value_of: ``"min"`` over the critics (SB3) or the ``"first"`` alone (the authors' code)
+    :param actor_value_of: the minimum over ``"all"`` critics (SB3) or the ``"first"`` alone (the authors' code)
 
     Source: SAC (Haarnoja et al. 2018), with SB3's factor 1/2 on the loss.
     """
 
-    actor_value_of: ActorValue = "min"
+    actor_value_of: ActorValue = "all"
 
     def next_value(self, q: th.Tensor) -> th.Tensor:
         """Return the minimum over the critics, ``(rows, 1)``."""
@@ -54,7 +54,7 @@ class SACObjective:
 
     def actor_value(self, q: th.Tensor) -> th.Tensor:
         """Return the minimum over the critics, or the first, ``(rows, 1)``."""
-        return q.min(dim=1).values if self.actor_value_of == "min" else q[:, 0]
+        return q.min(dim=1).values if self.actor_value_of == "all" else q[:, 0]
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,13 @@ class TQCObjective:
     """Truncated mixture of quantile critics.
 
     :param n_quantiles_to_drop: how many of the largest pooled target quantiles are dropped, over all critics
-    :param actor_value_of: ``"min"`` here means the mean over critics and quantiles (TQC's own), ``"first"`` the
-        first critic's mean
+    :param actor_value_of: the mean over ``"all"`` critics and quantiles, or over the ``"first"`` critic's
 
     Source: TQC (Kuznetsov et al. 2020), reductions as in sb3-contrib.
     """
 
     n_quantiles_to_drop: int
-    actor_value_of: ActorValue = "min"
+    actor_value_of: ActorValue = "all"
 
     def next_value(self, q: th.Tensor) -> th.Tensor:
         """Return the smallest pooled quantiles, sorted, ``(rows, kept)``."""
@@ -83,7 +82,7 @@ class TQCObjective:
     def actor_value(self, q: th.Tensor) -> th.Tensor:
         """Return the mean over quantiles and critics, or over the first critic's quantiles, ``(rows, 1)``."""
         per_critic = q.mean(dim=2)
-        return per_critic.mean(dim=1, keepdim=True) if self.actor_value_of == "min" else per_critic[:, :1]
+        return per_critic.mean(dim=1, keepdim=True) if self.actor_value_of == "all" else per_critic[:, :1]
 
 
 def quantile_huber_loss(quantiles: th.Tensor, target: th.Tensor) -> th.Tensor:

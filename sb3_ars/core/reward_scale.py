@@ -141,21 +141,19 @@ def _mean(statistics: RewardStatistics, reward_floor: float) -> tuple[th.Tensor,
     mean = statistics.mean
     if mean.shape[0] == 1:  # one task is on its own scale, whatever the sign of its rewards
         return _none(statistics, reward_floor)
-    if not mean.max() > 0:
-        listed = ", ".join(
-            f"{n} ({m:.3g})" for n, m in zip(statistics.task_names, mean.tolist(), strict=True)
-        )
-        raise ConfigError(
-            f"reward_scaling='mean' (Eq. 6) needs positive mean rewards, but no task has one: {listed}. "
-            "Shift the rewards to be positive in the env, or use reward_scaling='std'."
-        )
-    negative = [
-        f"{n} ({m:.3g})" for n, m in zip(statistics.task_names, mean.tolist(), strict=True) if not m >= 0
+    refused = [
+        f"{n} ({m:.3g})" for n, m in zip(statistics.task_names, mean.tolist(), strict=True) if not m > 0
     ]
-    if negative:
+    if refused:
         raise ConfigError(
-            f"reward_scaling='mean' (Eq. 6) has no meaning for tasks whose mean reward is negative: "
-            f"{', '.join(negative)}. Shift their rewards to be positive in the env, or use reward_scaling='std'."
+            f"reward_scaling='mean' (Eq. 6) has no meaning for tasks whose mean reward is not positive: "
+            f"{', '.join(refused)}. Shift their rewards to be positive in the env, collect more before the first "
+            "update (learning_starts) if they are only rare, or use reward_scaling='std'."
+        )
+    if mean.max() < reward_floor:
+        raise ConfigError(
+            f"Every task's mean reward is below reward_floor={reward_floor} (the largest is {mean.max():.3g}), so all "
+            "would get the same scale. Lower reward_floor, or make the rewards larger in the env."
         )
     return mean_reward_scale(mean, reward_floor), th.zeros_like(mean)
 

@@ -141,7 +141,7 @@ class GymVectorTaskEnv(VecEnv):
             action_space=venv.single_action_space,
             n_envs=n_envs,
         )
-        self._ids = _TaskIds(peek, range(n_envs) if task_of_env is None else task_of_env, task_names)
+        self._ids = _TaskIds(peek, task_of_env, task_names)
         self.task_names, self.task_of_env = self._ids.task_names, self._ids.task_of_env
         self.n_tasks = len(self.task_names)
         self.max_episode_steps = self._ids.max_episode_steps
@@ -321,11 +321,22 @@ class _Peek(NamedTuple):
 class _TaskIds:
     """Names and one-hot ids of the tasks of a vector env, and the checks that its tasks fit together."""
 
-    def __init__(self, peek: _Peek, task_of_env: Sequence[int], task_names: Sequence[str] | None) -> None:
-        self.task_of_env = checks.check_task_of_env(task_of_env, peek.n_envs)
-        self.task_names = _names(peek, self.task_of_env, task_names)
+    def __init__(
+        self, peek: _Peek, task_of_env: Sequence[int] | None, task_names: Sequence[str] | None
+    ) -> None:
+        given = range(peek.n_envs) if task_of_env is None else task_of_env
+        self.task_of_env = checks.check_task_of_env(given, peek.n_envs)
+        known = _metaworld_names(peek)
+        # what the tasks are called is worked out after this: a hidden goal explains more than a repeated name
+        _check_goals_and_rewards(peek, known or [f"task-{task}" for task in self.task_of_env])
+        if task_of_env is None and task_names is None and known is None:
+            raise ConfigError(
+                "This VectorEnv does not say what its tasks are. If its envs are different tasks, give "
+                f"make_multitask_env(venv, task_names=[...]) {peek.n_envs} names; if they are copies of one task, "
+                f"task_of_env={[0] * peek.n_envs}, or use SB3's make_vec_env."
+            )
+        self.task_names = _names(known, self.task_of_env, task_names)
         names = [self.task_names[task] for task in self.task_of_env]
-        _check_goals_and_rewards(peek, names)
         _check_inner_spaces(peek, names)
         whole = EnvFacts(peek.observation_space, peek.action_space, False, None, None)
         low, high, _ = checks.check_common_spaces(names, [whole] * peek.n_envs)
@@ -424,8 +435,8 @@ def _check_same_step(venv: VectorEnv[Any, Any, Any]) -> None:
             f"The gymnasium VectorEnv has autoreset mode {name}; SB3 needs SAME_STEP, where the step that "
             "ends an episode also starts the next. Build it with "
             "autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP "
-            '(gym.make_vec: vector_kwargs={"autoreset_mode": ...}), or give functions that return single '
-            "envs."
+            '(gym.make_vec: as it is for Meta-World, vector_kwargs={"autoreset_mode": ...} for others), or give '
+            "functions that return single envs to make_multitask_env."
         )
 
 
@@ -472,25 +483,29 @@ def _has_task_id(peek: _Peek, task_of_env: npt.NDArray[np.int64], n_tasks: int) 
     return True
 
 
-def _names(peek: _Peek, task_of_env: npt.NDArray[np.int64], given: Sequence[str] | None) -> tuple[str, ...]:
+def _metaworld_names(peek: _Peek) -> list[str] | None:
+    """Return each env's Meta-World task, or None where the envs are not Meta-World's."""
+    classes = peek.values("task_name")  # each Meta-World env holds its class name
+    known = task_names_of_classes() if classes else {}
+    names = [known[name] for name in classes or () if name in known]
+    return names if len(names) == peek.n_envs else None
+
+
+def _names(
+    known: Sequence[str] | None, task_of_env: npt.NDArray[np.int64], given: Sequence[str] | None
+) -> tuple[str, ...]:
     n_tasks = int(task_of_env.max()) + 1
     if given is not None:
         return checks.check_task_names(list(given), n_tasks)
-    default = tuple(f"task-{task}" for task in range(n_tasks))
-    classes = peek.values("task_name")  # each Meta-World env holds its class name
-    if classes is None:
-        return default
-    known = task_names_of_classes()
-    of_env = [known.get(name) for name in classes]
-    names = [of_env[int(np.argmax(task_of_env == task))] for task in range(n_tasks)]
-    if None in names:
-        return default
+    if known is None:
+        return tuple(f"task-{task}" for task in range(n_tasks))
+    names = tuple(known[int(np.argmax(task_of_env == task))] for task in range(n_tasks))
     if len(set(names)) < n_tasks:
         raise ConfigError(
-            f"Several envs have the same Meta-World task ({names}) but are to be different tasks. Say "
+            f"Several envs have the same Meta-World task ({', '.join(names)}) but are to be different tasks. Say "
             "which env belongs to which task with task_of_env=[...], or name the tasks with task_names=[...]."
         )
-    return tuple(str(name) for name in names)
+    return names
 
 
 def _horizon(peek: _Peek) -> int | None:

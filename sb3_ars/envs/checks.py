@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_ars.envs.workers import EnvFactory, EnvFacts
-from sb3_ars.errors import ConfigError, nearest
+from sb3_ars.errors import ConfigError, check_count, nearest
 
 __all__ = [
     "CommonSpaces",
@@ -46,16 +46,6 @@ class CommonSpaces(NamedTuple):
     low: npt.NDArray[np.float32]
     high: npt.NDArray[np.float32]
     action_space: gym.spaces.Box
-
-
-def check_count(option: str, value: object, minimum: int = 1) -> int:
-    """Return ``value`` if it is an integer of at least ``minimum``.
-
-    :raises ConfigError: otherwise; a bool is not an integer here
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
-        raise ConfigError(f"{option} must be an integer of at least {minimum}, got {value!r}.")
-    return int(value)
 
 
 def check_seed(value: object, option: str = "seed") -> int | None:
@@ -275,7 +265,7 @@ def _factories_of(
     for factory in factories:
         if not callable(factory):
             hint = (
-                " Give the function that makes it, such as lambda: env."
+                " Give a function that makes a new one at each call, such as the env's class."
                 if isinstance(factory, gym.Env)
                 else ""
             )

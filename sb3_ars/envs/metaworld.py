@@ -190,7 +190,7 @@ def make_metaworld_env(
         render_mode=render_mode,
     )
     names = metaworld_task_names(tasks)
-    return MultiTaskVecEnv(
+    env = MultiTaskVecEnv(
         [(name, [partial(make, name, first_goal=replica) for replica in range(per_task)]) for name in names],
         n_envs_per_task=per_task,
         seed=seed,
@@ -198,6 +198,8 @@ def make_metaworld_env(
         start_method=start_method,
         worker_timeout=worker_timeout,
     )
+    env.goals, env.n_goals = goals, n_goals
+    return env
 
 
 def metaworld_task_names(tasks: str | Sequence[str]) -> tuple[str, ...]:
@@ -211,6 +213,10 @@ def metaworld_task_names(tasks: str | Sequence[str]) -> tuple[str, ...]:
     known = list(env_dict.ALL_V3_ENVIRONMENTS)
     if isinstance(tasks, str) and tasks in _BENCHMARKS:
         return tuple(getattr(env_dict, f"{tasks}_V3"))
+    if not isinstance(tasks, str | Sequence):
+        raise ConfigError(
+            f"tasks={tasks!r} must be 'MT10', 'MT25', 'MT50', a task's name or a list of names."
+        )
     given = [tasks] if isinstance(tasks, str) else list(tasks)
     names = [_canonical(name, known) for name in given]
     repeated = sorted({name for name in names if names.count(name) > 1})

@@ -139,6 +139,10 @@ def _move(position: float, speed: float) -> tuple[float, float]:
 
 
 def _check_scales(reward_scales: Sequence[float]) -> list[float]:
+    if not isinstance(reward_scales, Sequence):
+        raise ConfigError(
+            f"reward_scales={reward_scales!r} must be a list of positive numbers, one per task."
+        )
     scales = list(reward_scales)
     if not 1 <= len(scales) <= 360 or any(not (math.isfinite(scale) and scale > 0) for scale in scales):
         raise ConfigError(

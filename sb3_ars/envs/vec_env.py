@@ -62,6 +62,10 @@ class MultiTaskVecEnv(VecEnv):
         """How many tasks there are."""
         self.task_of_env: npt.NDArray[np.int64] = np.repeat(np.arange(self.n_tasks, dtype=np.int64), per_task)
         """The task index of each env."""
+        self.goals: str | None = None
+        """How Meta-World's goals are chosen, where the tasks are Meta-World's."""
+        self.n_goals: int | None = None
+        """How many stored goals each task has, where the tasks are Meta-World's."""
         n_envs = len(factories)
         processes = checks.check_n_workers(n_workers, n_envs)
         method: Any = checks.check_start_method(start_method)
@@ -87,7 +91,7 @@ class MultiTaskVecEnv(VecEnv):
     def reset(self) -> npt.NDArray[np.float32]:
         """Start new episodes and return the first observations, ``(n_envs, obs_dim + n_tasks)``."""
         self._check_idle("reset")
-        with self._guarded():
+        with self._guarded("resetting its envs"):
             self.reset_infos = self._runner.reset(self._seeds, self._options)
         self._reset_seeds()
         self._reset_options()
@@ -114,7 +118,7 @@ class MultiTaskVecEnv(VecEnv):
         if not self._stepping:
             self._check_idle("step_wait")
             raise RuntimeError("step_wait() without step_async(): no step is under way.")
-        with self._guarded():
+        with self._guarded("stepping its envs"):
             ended = self._runner.step_wait()
         arrays = self._runner.arrays
         infos: list[dict[str, Any]] = [
@@ -228,14 +232,26 @@ class MultiTaskVecEnv(VecEnv):
             return self._runner.call(command, [range(self.num_envs)[index] for index in chosen], *args)
 
     @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
-        """Leave no step under way whatever happens, and close the envs once they have failed."""
+    def _guarded(self, doing: str | None = None) -> Iterator[None]:
+        """Leave no step under way whatever happens, and close the envs once they have failed.
+
+        :param doing: what an exception of an env in this process interrupted; None lets it through as it is
+        """
         try:
             yield
         except (WorkerError, EnvContractError) as error:
             self.close()
             self._closed_because = f"it failed with {type(error).__name__}"
             raise
+        except Exception as error:
+            if doing is None or not isinstance(self._runner, TaskEnvs):
+                raise
+            self.close()
+            self._closed_because = f"it failed with {type(error).__name__}"
+            raise WorkerError(
+                f"The env of task {self._runner.blame()!r} raised {type(error).__name__} while {doing}: {error}. "
+                "All envs were closed."
+            ) from error
         finally:
             self._stepping = False
 

@@ -209,6 +209,11 @@ class TaskEnvs:
                     f"The factory of task {self._tasks[self.current]!r} returned {type(env).__name__}, "
                     "not a gymnasium.Env. Give a function that takes no argument and returns a new env."
                 )
+            if any(env.unwrapped is other.unwrapped for other in self._envs):
+                raise ConfigError(
+                    f"The factory of task {self._tasks[self.current]!r} returned an env that is in use already; "
+                    "each env of each task must be a new one, or their episodes would run into each other."
+                )
             self._envs.append(env)
             facts.append(_facts(env))
         return facts

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, get_type_hints
 import yaml
 
 from sb3_ars.config import ARSConfig
-from sb3_ars.errors import ConfigError, nearest
+from sb3_ars.errors import ConfigError, check_count, nearest
 from sb3_ars.experiments import PRESETS, preset_names
 
 __all__ = [
@@ -104,6 +104,12 @@ class EvaluationConfig:
     every: int | None = None
     """Environment steps between evaluations during training; None evaluates at the end only."""
 
+    def __post_init__(self) -> None:
+        for option in ("n_episodes", "every"):
+            value = getattr(self, option)
+            if value is not None:
+                check_count(f"evaluation.{option}", value)
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -141,7 +147,10 @@ def load_config(path: Path) -> RunConfig:
     """
     if not path.is_file():
         raise ConfigError(f"{path} does not exist; give the folder of a run, which holds config.yaml.")
-    values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(values, Mapping):
         raise ConfigError(f"{path} is not the configuration of a run.")
     return _build(RunConfig, values, str(path))
@@ -176,6 +185,8 @@ def _merged(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
 
 def _build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
     """Make a nested dataclass of plain values; an unknown key is an error."""
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where}: {cls.__name__} must be a mapping of options, not {values!r}.")
     hints = get_type_hints(cls)
     kwargs = {}
     for key, value in values.items():

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from stable_baselines3.common.callbacks import BaseCallback
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
@@ -66,24 +68,30 @@ def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
     :raises ConfigError: before training, if an option cannot work or the folder cannot be written
     """
     protocol = protocol_of(config)
+    if config.algorithm.device.startswith("cuda") and not th.cuda.is_available():
+        raise ConfigError(
+            f"algorithm.device={config.algorithm.device!r}, but torch finds no GPU here; use 'auto' or 'cpu'."
+        )
     folder = _make_folder(config, name)
-    save_config(config, folder / "config.yaml")
-    _write_json(folder / "versions.json", run_versions())
-    with closing(make_env(config)) as env:
+    with ExitStack() as stack:
+        stack.callback(_remove_if_unused, folder)
+        env = stack.enter_context(closing(make_env(config)))
         model = build_model(config, env, verbose=1)
-        outputs = ["csv", "tensorboard", *(["stdout"] if config.verbose else [])]
-        model.set_logger(configure(str(folder), outputs))
+        evaluation_env = stack.enter_context(closing(_make_evaluation_env(config, protocol)))
+        save_config(config, folder / "config.yaml")
+        _write_json(folder / "versions.json", run_versions())
+        model.set_logger(
+            configure(str(folder), ["csv", "tensorboard", *(["stdout"] if config.verbose else [])])
+        )
         started = time.monotonic()
-        with closing(_make_evaluation_env(config, protocol)) as evaluation_env:
-            interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar)
-            seconds = time.monotonic() - started
-            model.save(folder / "policy")
-            evaluations = _evaluate_both(model, evaluation_env, protocol, progress_bar)
-    table = final_table(evaluations, model.reward_scale.scale.tolist())
-    _write_result(folder, table, protocol, model, seconds, interrupted)
-    plot_training(
-        folder / "progress.csv", list(env_names(model)), model.reward_scale_history, folder / "training.png"
-    )
+        interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar)
+        seconds = time.monotonic() - started
+        model.save(folder / "policy")
+        evaluations = _evaluate_both(model, evaluation_env, protocol, progress_bar)
+        table = final_table(evaluations, model.reward_scale.scale.tolist())
+        _write_result(folder, table, protocol, model, seconds, interrupted)
+        names = list(evaluations[True].task_names)
+        plot_training(folder / "progress.csv", names, model.reward_scale_history, folder / "training.png")
     return RunResult(folder, table, protocol.describe(), seconds)
 
 
@@ -99,18 +107,21 @@ def evaluate_run(
     :raises ConfigError: if the folder holds no run
     """
     config = load_config(folder / "config.yaml")
+    if n_episodes is None and protocol is None:
+        n_episodes = config.evaluation.n_episodes
     evaluation = dataclasses.replace(
-        config.evaluation,
-        protocol=protocol or config.evaluation.protocol,
-        n_episodes=n_episodes or (None if protocol else config.evaluation.n_episodes),
+        config.evaluation, protocol=protocol or config.evaluation.protocol, n_episodes=n_episodes
     )
     config = dataclasses.replace(config, evaluation=evaluation)
     chosen = protocol_of(config, own_horizon=protocol is None)
     if not (folder / "policy.zip").is_file():
         raise ConfigError(f"{folder} holds no policy.zip; the run did not finish.")
-    model = _ALGORITHMS[config.algorithm.algorithm].load(
-        folder / "policy.zip", device=config.algorithm.device
-    )
+    try:
+        model = _ALGORITHMS[config.algorithm.algorithm].load(folder / "policy.zip", device="auto")
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ConfigError(
+            f"{folder / 'policy.zip'} cannot be read as {config.algorithm.algorithm}: {error}"
+        ) from error
     started = time.monotonic()
     with closing(_make_evaluation_env(config, chosen)) as env:
         evaluations = _evaluate_both(model, env, chosen, progress_bar)
@@ -190,12 +201,6 @@ def final_table(evaluations: dict[bool, TaskEvaluation], reward_scale: list[floa
     return table
 
 
-def env_names(model: MultiTaskOffPolicyAlgorithm) -> list[str]:
-    """Return the task names of a multi-task model."""
-    assert model.task_names is not None
-    return model.task_names
-
-
 def _learn(
     model: MultiTaskOffPolicyAlgorithm,
     config: RunConfig,
@@ -205,7 +210,8 @@ def _learn(
     progress_bar: bool,
 ) -> bool:
     """Train; return whether the user interrupted."""
-    callbacks: list[BaseCallback] = []
+    bar = ProgressBarCallback()
+    callbacks: list[BaseCallback] = [bar] if progress_bar else []
     if config.evaluation.every is not None:
         callbacks.append(
             TaskEvalCallback(
@@ -216,21 +222,34 @@ def _learn(
                 log_path=folder,
             )
         )
+    total = config.algorithm.total_timesteps
     try:
-        model.learn(
-            config.algorithm.total_timesteps,
-            callback=callbacks,
-            log_interval=config.log_interval,
-            progress_bar=progress_bar,
-        )
+        model.learn(total, callback=callbacks, log_interval=config.log_interval)
     except KeyboardInterrupt:
+        if model.num_timesteps == 0:
+            raise
         print(f"\nInterrupted at step {model.num_timesteps:,}; evaluating and saving what was learned.")
         return True
-    finally:
+    except Exception:
         if model.num_timesteps > 0:
+            model.save(folder / "policy")
+            print(
+                f"\nTraining failed at step {model.num_timesteps:,}; what was learned is in {folder / 'policy.zip'}"
+            )
+        raise
+    finally:
+        if hasattr(bar, "pbar"):
+            bar.pbar.close()
+        if len(model.reward_scale_history) > 0:
             model.dump_logs()  # so that the log's last row is the run's last step
         model.logger.close()
     return False
+
+
+def _remove_if_unused(folder: Path) -> None:
+    """Leave no folder behind where training never began."""
+    if not (folder / "policy.zip").exists():
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _make_evaluation_env(config: RunConfig, protocol: EvaluationProtocol) -> VecEnv:
