@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -24,7 +26,7 @@ PACKAGES = (
 
 
 def run_versions() -> dict[str, Any]:
-    """Return Python, platform, processors, memory (GB), GPU and package versions; ``None`` for what is missing."""
+    """Return Python, platform, processors, memory (GB), GPU, package versions, commit; ``None`` if missing."""
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -33,6 +35,7 @@ def run_versions() -> dict[str, Any]:
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
         "packages": {name: _version(name) for name in PACKAGES},
+        "commit": _commit(),
     }
 
 
@@ -43,6 +46,26 @@ def available_cpus() -> int:
         if hasattr(psutil.Process, "cpu_affinity")
         else psutil.cpu_count() or 1
     )
+
+
+def _commit() -> str | None:
+    """Return the commit of the checkout this file is tracked in, with a plus where the package differs, or ``None``."""
+    file = Path(__file__)
+
+    def git(*arguments: str) -> str:
+        command = ["git", *arguments]
+        done = subprocess.run(
+            command, cwd=file.parent, capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        git(
+            "ls-files", "--error-unmatch", file.name
+        )  # fails where the package is installed inside another checkout
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def _version(package: str) -> str | None:

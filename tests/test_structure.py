@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -128,3 +129,36 @@ def test_the_readmes_table_names_real_presets_and_commands():
 def test_the_version_is_the_changelogs():
     changelog = (ROOT.parent / "CHANGELOG.md").read_text()
     assert f"## {importlib.import_module('sb3_ars').__version__}" in changelog
+
+
+def test_every_option_and_logged_number_is_documented():
+    from sb3_ars import ARSSAC, ARSConfig, make_toy_env
+    from sb3_ars.policies import ARSSACPolicy
+
+    options = (ROOT.parent / "docs" / "options.md").read_text()
+    for name in ARSConfig.__dataclass_fields__:
+        assert f"`{name}`" in options, name
+    for name in list(inspect.signature(ARSSACPolicy.__init__).parameters)[4:-1]:
+        assert f"`{name}`" in options, name
+    model = ARSSAC(
+        "MlpPolicy", make_toy_env(seed=0), batch_size=8, n_reset=0, policy_kwargs={"net_arch": [8]}
+    )
+    model.learn(320, log_interval=None)
+    written = {}
+    model.logger.record = lambda key, value, exclude=None: written.setdefault(key, value)
+    model.dump_logs()
+    sb3s = {
+        "rollout/ep_rew_mean",
+        "rollout/ep_len_mean",
+        "rollout/success_rate",
+        *(k for k in written if k[:5] == "time/"),
+    }
+    sb3s |= {
+        f"train/{key}" for key in ("n_updates", "ent_coef", "actor_loss", "critic_loss", "ent_coef_loss")
+    }
+    ours = {
+        key.replace("point-west", "<task>") for key in written if "point-" not in key or "point-west" in key
+    } - sb3s
+    assert len(ours) == 7
+    for key in ours:
+        assert f"`{key}`" in options, key
