@@ -83,6 +83,7 @@ def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
         model.set_logger(
             configure(str(folder), ["csv", "tensorboard", *(["stdout"] if config.verbose else [])])
         )
+        stack.callback(model.logger.close)
         started = time.monotonic()
         interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar)
         seconds = time.monotonic() - started
@@ -222,14 +223,14 @@ def _learn(
                 log_path=folder,
             )
         )
-    total = config.algorithm.total_timesteps
+    interrupted = False
     try:
-        model.learn(total, callback=callbacks, log_interval=config.log_interval)
+        model.learn(config.algorithm.total_timesteps, callback=callbacks, log_interval=config.log_interval)
     except KeyboardInterrupt:
-        if model.num_timesteps == 0:
+        if model.replay_buffer is None or model.replay_buffer.size() == 0:
             raise
+        interrupted = True
         print(f"\nInterrupted at step {model.num_timesteps:,}; evaluating and saving what was learned.")
-        return True
     except Exception:
         if model.num_timesteps > 0:
             model.save(folder / "policy")
@@ -240,10 +241,8 @@ def _learn(
     finally:
         if hasattr(bar, "pbar"):
             bar.pbar.close()
-        if len(model.reward_scale_history) > 0:
-            model.dump_logs()  # so that the log's last row is the run's last step
-        model.logger.close()
-    return False
+    model.dump_logs()  # so that the log's last row is the run's last step
+    return interrupted
 
 
 def _remove_if_unused(folder: Path) -> None:
