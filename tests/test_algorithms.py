@@ -342,7 +342,7 @@ def test_negative_mean_rewards_stop_before_the_first_update():
 
     env = make_multitask_env({"good": PointTask, "sad": Negative}, seed=0, n_workers=0)
     model = ARSSAC("MlpPolicy", env, n_reset=0, **SMALL)
-    with pytest.raises(ConfigError, match=r"not positive: sad \(-1\)"):
+    with pytest.raises(ConfigError, match=r"negative: sad \(-1\)"):
         model.learn(200)
     assert model._n_updates == 0 and model.replay_buffer.size() > 0
 

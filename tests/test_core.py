@@ -93,11 +93,20 @@ def test_scaling_is_linear_in_the_scale():
 
 @pytest.mark.parametrize(
     ("mean", "named"),
-    [([1.0, -0.5], "push"), ([-1.0, -0.5], "reach"), ([0.0, 0.0], "push"), ([1.0, float("nan")], "push")],
+    [
+        ([1.0, -0.5], "push"),
+        ([-1.0, -0.5], "reach"),
+        ([0.0, 0.0], "reward_floor"),
+        ([1.0, float("nan")], "push"),
+    ],
 )
-def test_means_without_a_positive_meaning_are_refused_by_task_name(mean, named):
+def test_means_without_a_meaning_are_refused_by_name(mean, named):
     with pytest.raises(ConfigError, match=named):
         scale_of("mean", statistics(mean, names=["reach", "push"]))
+
+
+def test_a_task_without_any_reward_yet_is_floored():
+    assert scale_of("mean", statistics([2.0, 0.0]))[0] == [1.0, 200.0]
 
 
 def test_a_floor_above_every_mean_is_refused():

@@ -141,14 +141,14 @@ def _mean(statistics: RewardStatistics, reward_floor: float) -> tuple[th.Tensor,
     mean = statistics.mean
     if mean.shape[0] == 1:  # one task is on its own scale, whatever the sign of its rewards
         return _none(statistics, reward_floor)
+    # a mean of exactly 0 is met: pick-place-wall pays nothing to random actions; the floor gives such a task its c_i
     refused = [
-        f"{n} ({m:.3g})" for n, m in zip(statistics.task_names, mean.tolist(), strict=True) if not m > 0
+        f"{n} ({m:.3g})" for n, m in zip(statistics.task_names, mean.tolist(), strict=True) if not m >= 0
     ]
     if refused:
         raise ConfigError(
-            f"reward_scaling='mean' (Eq. 6) has no meaning for tasks whose mean reward is not positive: "
-            f"{', '.join(refused)}. Shift their rewards to be positive in the env, collect more before the first "
-            "update (learning_starts) if they are only rare, or use reward_scaling='std'."
+            f"reward_scaling='mean' (Eq. 6) has no meaning for tasks whose mean reward is negative: "
+            f"{', '.join(refused)}. Shift their rewards to be positive in the env, or use reward_scaling='std'."
         )
     if mean.max() < reward_floor:
         raise ConfigError(
