@@ -1,42 +1,37 @@
-"""The preset ``demo``, which ``make demo`` runs, over several seeds: does it learn in minutes?
+"""Gathers finished runs of the preset ``demo`` into one file, which the README quotes.
 
-GOMP_SPINCOUNT=1000 python benchmarks/demo.py --seeds 3
+for seed in 0 1; do sb3-ars train demo --seed $seed; done
+python benchmarks/demo.py runs/demo-seed0 runs/demo-seed1
 """
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
 import json
-import tempfile
+import sys
 from pathlib import Path
 
-from sb3_ars.experiments.config import load_preset
-from sb3_ars.experiments.runner import train
-from sb3_ars.versions import run_versions
+import yaml
 
 RESULTS = Path(__file__).parent / "results" / "demo.json"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=3)
-    arguments = parser.parse_args()
-    runs = []
-    for seed in range(arguments.seeds):
-        with tempfile.TemporaryDirectory() as folder:
-            config = dataclasses.replace(load_preset("demo"), seed=seed, output=Path(folder))
-            result = train(config, "demo")
-            runs.append({"seed": seed, **json.loads((result.folder / "result.json").read_text())})
-        summary = {key: runs[-1][key] for key in ("seed", "mean_success", "training_seconds")}
-        print(summary, flush=True)
-        RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(
-            json.dumps({"runs": runs, "versions": run_versions()}, indent=2) + "\n", encoding="utf-8"
+    folders = [Path(argument) for argument in sys.argv[1:]]
+    if not folders:
+        sys.exit(__doc__)
+    runs = [
+        {
+            "seed": yaml.safe_load((folder / "config.yaml").read_text())["seed"],
+            **json.loads((folder / "result.json").read_text()),
+            "versions": json.loads((folder / "versions.json").read_text()),
+        }
+        for folder in folders
+    ]
+    RESULTS.write_text(json.dumps({"runs": runs}, indent=2) + "\n", encoding="utf-8")
+    for run in runs:
+        print(
+            f"seed {run['seed']}: mean success {run['mean_success']:.2f}, {run['training_seconds'] / 60:.1f} minutes"
         )
-    print(f"written to {RESULTS}")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import inspect
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -162,3 +163,22 @@ def test_every_option_and_logged_number_is_documented():
     assert len(ours) == 7
     for key in ours:
         assert f"`{key}`" in options, key
+
+
+def measured_rows():
+    """The README's rows of measured numbers, from the files the benchmarks wrote."""
+    results = ROOT.parent / "benchmarks" / "results"
+    toy = json.loads((results / "toy_learning.json").read_text())
+    lowest = toy["lowest_over_seeds_and_tasks_of_ars"]
+    quiet = max(max(success[2:]) for success in toy["success"]["sac"])
+    yield f"| toy tasks, {toy['seeds']} seeds, `ars` | lowest success of any task and seed: {lowest:.2f} |"
+    yield f"| the same without scaling and resets | highest success of a quiet task in any seed: {quiet:.2f} |"
+    for run in json.loads((results / "demo.json").read_text())["runs"]:
+        minutes = run["training_seconds"] / 60
+        yield f"| `make demo`, seed {run['seed']} | mean success {run['mean_success']:.2f} in {minutes:.1f} minutes |"
+
+
+def test_the_readmes_numbers_are_the_benchmarks():
+    readme = (ROOT.parent / "README.md").read_text()
+    for row in measured_rows():
+        assert row in readme, row
