@@ -80,6 +80,8 @@ def _train(arguments: list[str]) -> int:
     )
     result = train(config, name)
     _print_table(result.table, result.protocol)
+    if result.seconds_by_part is not None:
+        _print_profile(result.seconds_by_part)
     print(f"Trained in {result.seconds / 60:.1f} minutes.")
     for label, file in (("policy", "policy.zip"), ("picture", "training.png"), ("log", "progress.csv")):
         print(f"  {label:8} {result.folder / file}")
@@ -134,6 +136,18 @@ def _print_table(frame: pd.DataFrame, protocol: str) -> None:
     table.add_section()
     means = [f.format(frame[c].mean()) for f, c in zip(formats[:3], columns[:3], strict=True)]
     table.add_row("mean", *means, "", "")
+    Console().print(table)
+
+
+def _print_profile(seconds_by_part: dict[str, float]) -> None:
+    from sb3_ars.profiling import PARTS
+
+    total = sum(seconds_by_part.values())
+    table = Table("part", "what it is", box=None, title="Where the training time went", title_justify="left")
+    table.add_column("seconds", justify="right")
+    table.add_column("share", justify="right")
+    for part, seconds in seconds_by_part.items():
+        table.add_row(part, PARTS[part], f"{seconds:,.1f}", f"{seconds / total:.1%}")
     Console().print(table)
 
 

@@ -10,10 +10,12 @@ from sb3_ars.core.objectives import ActorValue
 from sb3_ars.core.reward_scale import parse_reward_scaling
 from sb3_ars.errors import ConfigError, check_count, nearest
 
-__all__ = ["ARSConfig", "ResetScope", "RewardScaling"]
+__all__ = ["ARSConfig", "Execution", "ExecutionConfig", "Precision", "ResetScope", "RewardScaling"]
 
 ResetScope = Literal["actor_critic", "critic", "none"]
 RewardScaling = Literal["mean", "std", "normalization", "none"] | float | tuple[float, ...] | dict[str, float]
+Precision = Literal["auto", "fp32", "tf32", "bf16"]
+Execution = Literal["auto", "eager", "fused", "compile", "cudagraph"]
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,27 @@ class ARSConfig:
         if n_reset is None:
             n_reset = 4 if n_tasks > 1 else 0
         return [total_timesteps * (k + 1) // (n_reset + 1) for k in range(n_reset)]
+
+
+@dataclass(frozen=True)
+class ExecutionConfig:
+    """Options of how the arithmetic is done; none of them changes what is computed, beyond rounding.
+
+    :raises ConfigError: naming the option, what was given and what is allowed
+    """
+
+    precision: Precision = "auto"
+    """"fp32"; "bf16": bfloat16 operands between hidden layers; "tf32" (CUDA); auto is fp32 on CPU, tf32 on CUDA."""
+    execution: Execution = "auto"
+    """"eager": SB3's arithmetic to the bit; "fused": oneDNN layers (CPU); "compile": torch.compile; "cudagraph"."""
+    overlap: bool | None = None
+    """Whether updates run while the environments step, on data one step older; None is yes on CUDA, no on CPU."""
+
+    def __post_init__(self) -> None:
+        _check_choice("precision", self.precision, get_args(Precision))
+        _check_choice("execution", self.execution, get_args(Execution))
+        if self.overlap not in (None, True, False):
+            raise ConfigError(f"overlap={self.overlap!r} must be True, False or None.")
 
 
 def _check_positive(option: str, value: object) -> None:

@@ -16,7 +16,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from sb3_ars.errors import ConfigError
-from sb3_ars.nets.mlp import with_layer_norm, xavier_
+from sb3_ars.nets.mlp import MLP, with_layer_norm, xavier_
 
 __all__ = [
     "ARSSACPolicy",
@@ -134,6 +134,7 @@ class _PolicyOptions:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)  # type: ignore[attr-defined]
         actor = self.actor_class(**kwargs)
         actor.std = self.std  # type: ignore[assignment]  # nn.Module's attributes are typed as tensors and modules
+        actor.latent_pi = MLP(*actor.latent_pi)
         if self.weight_init == "xavier":
             xavier_(actor)
         return actor.to(self.device)  # type: ignore[attr-defined]
@@ -141,10 +142,11 @@ class _PolicyOptions:
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)  # type: ignore[attr-defined]
         critic: Any = self.critic_class(**{**kwargs, "activation_fn": self._critic_activation_fn})
-        if self.critic_layer_norm:
-            critic.q_networks = [with_layer_norm(net) for net in critic.q_networks]
-            for index, net in enumerate(critic.q_networks):
-                setattr(critic, f"qf{index}", net)
+        critic.q_networks = [
+            with_layer_norm(net) if self.critic_layer_norm else MLP(*net) for net in critic.q_networks
+        ]
+        for index, net in enumerate(critic.q_networks):
+            setattr(critic, f"qf{index}", net)
         if self.weight_init == "xavier":
             xavier_(critic)
         return critic.to(self.device)  # type: ignore[attr-defined]

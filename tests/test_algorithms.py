@@ -105,10 +105,13 @@ def test_a_mean_that_turns_negative_keeps_the_scales_and_the_run():
     assert model.n_resets == 1 and len(model.reward_scale_history) == 1
 
 
-def test_losses_that_are_not_finite_stop_training():
+@pytest.mark.parametrize("validates", [True, False])
+def test_losses_that_are_not_finite_stop_training(monkeypatch, validates):
     model = toy_model(n_reset=0).learn(100)
     with th.no_grad():
         model.critic.qf0[0].weight[0, 0] = float("nan")
+    # the actor follows; torch.compile turns this check of torch's off for the whole process
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", validates)
     with pytest.raises(DivergedError, match="NaN or infini"):
         model.learn(400, reset_num_timesteps=False)
 
@@ -126,7 +129,7 @@ def test_a_file_that_is_no_buffer_leaves_the_models_own(tmp_path):
     model = toy_model()
     kept = model.replay_buffer
     (tmp_path / "buffer.pkl").write_bytes(pickle.dumps({"not": "a buffer"}))
-    with pytest.raises(AssertionError):
+    with pytest.raises(ConfigError, match="is a pickle"):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is kept
 
@@ -377,7 +380,6 @@ BAD_OPTIONS = [
     ({"stats_window_size": 0}, "stats_window_size=0"),
     ({"learning_rate": -1}, "learning_rate=-1"),
     ({"n_steps": 3}, "n_steps=3"),
-    ({"optimize_memory_usage": True}, "optimize_memory_usage"),
     ({"policy_kwargs": {"std": "sigmoid"}}, "std='sigmoid'"),
     ({"policy_kwargs": {"weight_init": "he"}}, "weight_init='he'"),
     ({"policy_kwargs": {"critic_layer_norm": "yes"}}, "critic_layer_norm='yes'"),

@@ -46,26 +46,37 @@ def test_every_task_equals_the_stock_env_to_the_bit(task):
     np.random.seed(3)
     global_state = np.random.get_state()[1].copy()
     ours = make_metaworld_env(task, seed=1, n_workers=0, max_episode_steps=500)
-    ours.reset()
-    ours.step(np.ones((1, 4)))
-    observations = ours.reset()  # the second episode: what the first one leaves behind would show
-    stock = stock_env(task, ours.get_attr("rand_vec")[0])
-    expected = stock.reset()[0]
+    stock = MetaworldTask(task, fast=False)
+    for seed in (1, None):  # the second episode: what the first one leaves behind would show
+        observations, expected = ours.reset(), stock.reset(seed=seed)[0]
+        ours.step(np.ones((1, 4)))
+        stock.step(np.ones(4, np.float32))
+    np.testing.assert_array_equal(ours.get_attr("rand_vec")[0], stock.rand_vec)
     assert expected[-3:].any(), "the goal is hidden"
     rng = np.random.default_rng(0)
-    for step in range(500):
+    for step in range(1, 500):
         np.testing.assert_array_equal(observations[0, :39], expected.astype(np.float32))
         action = rng.uniform(-1, 1, 4).astype(np.float32)
         observations, rewards, dones, infos = ours.step(action[None])
         expected, reward, _, truncated, info = stock.step(action)
-        assert rewards[0] == np.float32(reward) and infos[0]["success"] == info["success"]
+        assert rewards[0] == pytest.approx(reward, 1e-7) and infos[0]["success"] == info["success"]
         assert dones[0] == truncated == (step == 499)
         if step == 499:
             np.testing.assert_array_equal(infos[0]["terminal_observation"][:39], expected.astype(np.float32))
-            break
     np.testing.assert_array_equal(np.random.get_state()[1], global_state)
     ours.close()
     stock.close()
+
+
+def test_the_stock_path_equals_meta_world_set_to_the_goal():
+    ours = MetaworldTask("push", fast=False)
+    observations = [ours.reset(seed=1)[0]]
+    stock = stock_env("push-v3", ours.rand_vec)
+    expected = [stock.reset()[0]]
+    for _ in range(30):
+        observations.append(ours.step(np.ones(4, np.float32))[0])
+        expected.append(stock.step(np.ones(4, np.float32))[0])
+    np.testing.assert_array_equal(observations, expected)
 
 
 @pytest.mark.parametrize("goals", ["random", "stored"])
@@ -179,6 +190,7 @@ def test_names_come_in_meta_world_s_order_with_or_without_version():
             "goals must be one of 'random', 'stored', 'ordered'",
         ),
         (lambda: make_metaworld_env("reach", reward_version="v3"), "reward_version must be one of"),
+        (lambda: make_metaworld_env("reach", fast="no"), "fast='no' must be True or False"),
         (
             lambda: make_metaworld_env("reach", max_episode_steps=0),
             "max_episode_steps=.* must be .* at least 1",

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -270,8 +271,6 @@ def test_a_factory_that_raises_is_named_and_nothing_is_left(n_workers):
 
 
 def test_a_factory_that_cannot_travel_is_named():
-    import threading
-
     lock = threading.Lock()
     with pytest.raises(ConfigError, match=r"task 'locked' cannot be sent .* n_workers=0"):
         MultiTaskVecEnv({"a": Small, "locked": lambda: lock and Small()}, n_workers=1)
@@ -298,18 +297,15 @@ def test_a_dropped_env_ends_its_workers():
     assert children_are_gone(pids)
 
 
-def test_an_interrupted_step_leaves_the_env_usable(monkeypatch):
+def test_an_interrupted_step_leaves_the_env_usable():
     env = build()
     expected = env.reset()
-    env.step_async(np.zeros((2, 2)))
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("multiprocessing.connection.wait", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            env.step_wait()
+    pids = env.env_method("pid")
+    os.kill(pids[0], signal.SIGSTOP)  # so that the step is under way when the interrupt comes
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        env.step(np.zeros((2, 2)))
+    os.kill(pids[0], signal.SIGCONT)
     env.seed(0)
     np.testing.assert_array_equal(env.reset(), expected)
     env.close()

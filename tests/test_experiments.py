@@ -254,8 +254,16 @@ def test_a_configuration_reaches_the_model():
     from sb3_ars import make_toy_env
 
     config = RunConfig(
-        policy=dataclasses.replace(RunConfig().policy, net_arch=(8,), critic_layer_norm=True, std="softplus")
+        policy=dataclasses.replace(RunConfig().policy, net_arch=(8,), critic_layer_norm=True, std="softplus"),
+        algorithm=dataclasses.replace(
+            RunConfig().algorithm, precision="bf16", execution="fused", overlap=True
+        ),
     )
     model = build_model(config, make_toy_env(seed=0))
     assert type(model.critic.qf0[0]).__name__ == "LayerNorm" and model.policy.std == "softplus"
-    assert model.actor.optimizer.defaults["fused"] and model.batch_size == 100 and model.actor_value == "all"
+    assert model._plan.execution == "fused" and model._plan.bf16 and model._plan.overlap
+    assert (
+        model.actor.optimizer.param_groups[0]["fused"]
+        and model.batch_size == 100
+        and model.actor_value == "all"
+    )

@@ -7,7 +7,7 @@ import torch as th
 
 from sb3_ars import ARSSAC, ARSTQC, make_toy_env
 
-pytestmark = pytest.mark.gpu
+pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:.*leaves no updates")]
 SMALL = {
     "policy_kwargs": {"net_arch": [32, 32]},
     "batch_size": 16,
@@ -52,6 +52,92 @@ def test_an_update_on_cuda_is_the_update_on_the_cpu_up_to_rounding():
         model.train(gradient_steps=3, batch_size=16)
     for a, b in zip(cpu.policy.parameters(), cuda.policy.parameters(), strict=True):
         assert th.allclose(a, b.cpu(), atol=1e-4)
+
+
+def trained(algorithm=ARSSAC, steps=1200, layer_norm=False, **options):
+    options = {
+        "n_reset": 2,
+        "learning_starts": 200,
+        "precision": "fp32",
+        "overlap": False,
+        **SMALL,
+        **options,
+    }
+    options["policy_kwargs"] = {"net_arch": [32, 32], "critic_layer_norm": layer_norm}
+    return algorithm("MlpPolicy", make_toy_env(seed=0), device="cuda", **options).learn(steps)
+
+
+def replayed(execution, n_updates, algorithm=ARSSAC, layer_norm=False, precision="fp32"):
+    """Updates on the data and the random numbers of the eager run."""
+    model = trained(algorithm, 200, layer_norm, n_reset=0, execution=execution, precision=precision)
+    th.cuda.manual_seed(7)
+    model.train(gradient_steps=n_updates, batch_size=16)
+    return th.cat([p.detach().flatten().cpu() for p in model.policy.parameters()])
+
+
+@pytest.mark.filterwarnings("ignore")  # torch.compile's about torch
+@pytest.mark.parametrize("algorithm", [ARSSAC, ARSTQC])
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("execution", ["cudagraph", "compile"])
+def test_captured_and_compiled_updates_are_the_eager_ones(algorithm, layer_norm, execution):
+    # three warm-up updates, then the graph; the same generators, so the same batches and noise
+    before, eager = (replayed("eager", n, algorithm, layer_norm) for n in (0, 40))
+    found = replayed(execution, 40, algorithm, layer_norm)
+    assert (eager - found).norm() < 1e-2 * (eager - before).norm()
+
+
+def test_a_captured_run_updates_resets_and_logs_as_an_eager_one(tmp_path):
+    models = [trained(execution=execution) for execution in ("eager", "cudagraph")]
+    assert models[1]._plan.execution == "cudagraph" and models[1]._captured_updates._captured
+    assert models[0]._n_updates == models[1]._n_updates and models[1].n_resets == 2
+    assert all(th.isfinite(p).all() for p in models[1].policy.parameters())
+    models[1].save(tmp_path / "model")
+    loaded = ARSSAC.load(tmp_path / "model", env=make_toy_env(seed=0), device="cuda")
+    loaded.replay_buffer = models[1].replay_buffer
+    loaded.learn(200, reset_num_timesteps=False)
+    assert loaded._captured_updates._captured
+
+
+def test_a_learning_rate_schedule_reaches_the_captured_update():
+    model = trained(steps=400, n_reset=0, execution="cudagraph")
+    model.lr_schedule = lambda progress: 0.0
+    before = [p.clone() for p in model.policy.actor.parameters()]
+    model.train(gradient_steps=3, batch_size=16)
+    assert all(th.equal(a, b) for a, b in zip(before, model.policy.actor.parameters(), strict=True))
+
+
+def test_the_captured_actor_acts_as_the_policy_does():
+    model = trained(steps=400, n_reset=0, execution="cudagraph")
+    obs = model._last_obs
+    for _ in range(5):  # warm-up, capture, replay
+        captured, _ = model.predict(obs, deterministic=True)
+    eager, _ = model.policy.predict(obs, deterministic=True)
+    assert abs(captured - eager).max() < 1e-5
+    sampled = [model.predict(obs)[0] for _ in range(6)]
+    assert abs(sampled[4] - sampled[5]).max() > 1e-3
+
+
+@pytest.mark.parametrize("execution", ["eager", "cudagraph"])
+def test_overlap_on_cuda_is_the_default_and_deterministic(execution):
+    assert trained(steps=400, n_reset=0, overlap=None)._plan.overlap
+    runs = [trained(execution=execution, overlap=True) for _ in range(2)]
+    for a, b in zip(*(run.policy.parameters() for run in runs), strict=True):
+        assert th.equal(a, b)
+
+
+@pytest.mark.parametrize("precision", ["tf32", "bf16"])
+def test_reduced_precision_on_cuda_stays_near(precision):
+    before, exact = (replayed("eager", n) for n in (0, 40))
+    rounded = replayed("cudagraph", 40, precision=precision)
+    assert (exact - rounded).norm() < 0.3 * (exact - before).norm()
+
+
+def test_growing_the_terminal_frames_captures_anew():
+    model = ARSSAC(
+        "MlpPolicy", make_toy_env(seed=0), device="cuda", n_reset=0, optimize_memory_usage=True, **SMALL
+    )
+    model.learn(4000)
+    assert model._captured_updates._key[-1] == model.replay_buffer.storage_version > 0
 
 
 def test_a_buffer_pickled_on_cuda_draws_the_same_rows_again():

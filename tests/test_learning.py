@@ -28,6 +28,12 @@ def test_ars_learns_every_toy_task(success, seed):
 
 
 @pytest.mark.slow
+def test_bf16_learns_every_toy_task_as_well(success):
+    exact, rounded = (np.mean([success(arm, seed) for seed in SEEDS], axis=0) for arm in ("ars", "ars-bf16"))
+    assert (rounded >= exact - 0.05).all(), (exact, rounded)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_without_scaling_and_resets_the_quiet_tasks_stay_under_half_of_that(success, seed):
     loud, quiet = success("sac", seed)[:2], success("sac", seed)[2:]

@@ -79,6 +79,7 @@ def test_the_task_buffer_gives_the_same_learner_with_sb3s_sampler_swapped_in(the
 
     options = {**OPTIONS, "learning_starts": 50}
     a = theirs("MlpPolicy", env(), **options).learn(250)
+    options["execution"] = "eager"
     b = ours("MlpPolicy", env(), replay_buffer_class=SB3Sampler, n_reset=0, **options).learn(250)
     assert isinstance(a.replay_buffer, ReplayBuffer) and isinstance(b.replay_buffer, SB3Sampler)
     assert_same_learner(a, b)

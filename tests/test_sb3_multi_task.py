@@ -393,7 +393,6 @@ def test_normalised_observations_train_save_load_and_predict(algorithm, tmp_path
     [
         ({"use_sde": True}, "use_sde=True"),
         ({"n_steps": 3}, "n_steps=3 is not available with several tasks"),
-        ({"optimize_memory_usage": True}, "optimize_memory_usage is not available"),
         ({"replay_buffer_class": ReplayBuffer}, "mixes the tasks"),
         ({"batch_size": 101}, "batch_size=101"),
         ({"reward_scaling": [1.0]}, "reward_scaling holds 1 numbers for 2 tasks"),

@@ -14,7 +14,8 @@ import sb3_ars
 
 ROOT = Path(sb3_ars.__file__).parent
 LAYER = {  # each may import those before it, and its own
-    "errors": 0, "core": 1, "nets": 2, "metrics": 2, "versions": 2, "config": 2, "envs": 2, "buffers": 3, "policies": 3,
+    "errors": 0, "profiling": 0, "core": 1,
+    "nets": 2, "metrics": 2, "versions": 2, "config": 2, "envs": 2, "buffers": 3, "policies": 3,
     "callbacks.ars": 4,  # beneath the algorithms, whose learn() installs it
     "algorithms": 5, "evaluation": 5, "callbacks": 6, "experiments": 7, "doctor": 7, "cli": 8, "": 9,
 }  # fmt: skip
@@ -134,10 +135,11 @@ def test_the_version_is_the_changelogs():
 
 def test_every_option_and_logged_number_is_documented():
     from sb3_ars import ARSSAC, ARSConfig, make_toy_env
+    from sb3_ars.config import ExecutionConfig
     from sb3_ars.policies import ARSSACPolicy
 
     options = (ROOT.parent / "docs" / "options.md").read_text()
-    for name in ARSConfig.__dataclass_fields__:
+    for name in [*ARSConfig.__dataclass_fields__, *ExecutionConfig.__dataclass_fields__]:
         assert f"`{name}`" in options, name
     for name in list(inspect.signature(ARSSACPolicy.__init__).parameters)[4:-1]:
         assert f"`{name}`" in options, name

@@ -8,9 +8,12 @@ from __future__ import annotations
 import io
 import json
 import pathlib
+import pickle
 import warnings
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -22,19 +25,29 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import open_path
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_ars.algorithms.execution import CapturedActor, ExecutionPlan, WorkWhileStepping, plan_execution
 from sb3_ars.algorithms.task_log import TaskLog
 from sb3_ars.buffers import TaskReplayBuffer
 from sb3_ars.callbacks.ars import ARSCallback
-from sb3_ars.config import ARSConfig, ResetScope, RewardScaling
+from sb3_ars.config import ARSConfig, Execution, ExecutionConfig, Precision, ResetScope, RewardScaling
 from sb3_ars.core.objectives import ActorValue, Objective
 from sb3_ars.core.reset import reset_module_, reset_optimizer_
 from sb3_ars.core.reward_scale import RewardScale, RewardStatistics, parse_reward_scaling
-from sb3_ars.core.update import Hyperparameters, UpdateState, update
+from sb3_ars.core.runner import CapturedCalls, compiled, prepare_optimizer_, tf32
+from sb3_ars.core.update import Hyperparameters, Metrics, Timer, UpdateState, update
 from sb3_ars.envs import make_multitask_env
 from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, check_count
+from sb3_ars.nets.mlp import set_arithmetic
 
 __all__ = ["MultiTaskOffPolicyAlgorithm"]
 
@@ -58,7 +71,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         of the run and at least one batch per task
     :param batch_size: rows per task in each update
     :param ent_coef: with several tasks there is one temperature per task
-    :param use_sde: refused; so are, with several tasks, ``n_steps > 1`` and ``optimize_memory_usage``
+    :param use_sde: refused; so is ``n_steps > 1`` with several tasks
 
     Ours are the fields of :class:`sb3_ars.config.ARSConfig`:
 
@@ -69,6 +82,13 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param reset: ``"actor_critic"``, ``"critic"`` or ``"none"``
     :param updates_after_reset: gradient steps right after a reset
     :param actor_value: critics the actor's loss reads: ``"all"`` (SB3's reduction) or ``"first"``
+
+    and of :class:`sb3_ars.config.ExecutionConfig`, which change speed and rounding:
+
+    :param precision: ``"auto"``, ``"fp32"``, ``"tf32"`` (CUDA) or ``"bf16"``
+    :param execution: ``"auto"``, ``"eager"`` (SB3's arithmetic to the bit), ``"fused"`` (CPU), ``"compile"`` or
+        ``"cudagraph"``
+    :param overlap: whether updates run while the environments step; ``None`` is yes on CUDA
     :raises ConfigError: if options contradict each other or the environment
     """
 
@@ -91,6 +111,15 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     reset: ResetScope | None
     updates_after_reset: int
     actor_value: ActorValue
+
+    # ExecutionConfig's, likewise
+    precision: Precision
+    execution: Execution
+    overlap: bool | None
+
+    _update_state: UpdateState
+    timer: Timer
+    """Measures the parts of a run; assign a :class:`~sb3_ars.profiling.PartTimer` to profile."""
 
     def __init__(
         self,
@@ -129,10 +158,14 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         reset: ResetScope | None = "actor_critic",
         updates_after_reset: int = 1000,
         actor_value: ActorValue = "all",
+        precision: Precision = "auto",
+        execution: Execution = "auto",
+        overlap: bool | None = None,
     ) -> None:
         config = ARSConfig(
             n_reset, param_resets, reward_scaling, reward_floor, reset, updates_after_reset, actor_value
         )
+        execution_config = ExecutionConfig(precision, execution, overlap)
         is_auto = _is_auto(learning_starts)
         super().__init__(
             policy,
@@ -166,7 +199,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             device=device,
             _init_setup_model=False,
         )
-        self.__dict__.update(vars(config))
+        self.__dict__.update(vars(config), **vars(execution_config))
+        self.timer = nullcontext
         self._auto_learning_starts = 0 if is_auto else None  # what "auto" last came to
         self.task_names: list[str] | None = None
         self.task_of_env: list[int] = []
@@ -187,7 +221,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         return OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
     def _setup_model(self) -> None:
-        self.config  # noqa: B018  # validates: load() replaces attributes after the constructor's own check
+        self.config, self.execution_config  # noqa: B018  # validate: load() replaces attributes after __init__'s check
         if _is_auto(self.learning_starts):  # given to load()
             self.learning_starts = self._auto_learning_starts = 0
         self._check_options()
@@ -201,13 +235,19 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             self._make_temperature_per_task(self.log_ent_coef)
         self.reward_scale = RewardScale(self.n_tasks, self.device)
         self._task_log = TaskLog(self.task_names or [], self._stats_window_size)
-        self._update_state = self._make_update_state()
         self._warned_of_waiting = False
+        self._updates_are_done = False
+        self._prepare_execution()
 
     @property
     def config(self) -> ARSConfig:
         """The options as the validated dataclass."""
         return ARSConfig(**{name: getattr(self, name) for name in ARSConfig.__dataclass_fields__})
+
+    @property
+    def execution_config(self) -> ExecutionConfig:
+        """The options of execution as the validated dataclass."""
+        return ExecutionConfig(self.precision, self.execution, self.overlap)
 
     @property
     def n_tasks(self) -> int:
@@ -301,10 +341,14 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
 
     def _make_update_state(self) -> UpdateState:
+        actor, critic, critic_target = self.actor, self.critic, self.critic_target
+        if self._plan.execution == "compile":
+            actor = compiled(actor, "get_action_dist_params")
+            critic, critic_target = compiled(critic, "q_values"), compiled(critic_target, "q_values")
         return UpdateState(
-            actor=self.actor,
-            critic=self.critic,
-            critic_target=self.critic_target,
+            actor=actor,
+            critic=critic,
+            critic_target=critic_target,
             actor_optimizer=self.actor.optimizer,
             critic_optimizer=self.critic.optimizer,
             log_ent_coef=self.log_ent_coef,
@@ -313,6 +357,34 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             norm_statistics=self.batch_norm_stats,  # type: ignore[attr-defined]  # SAC's and TQC's
             norm_statistics_target=self.batch_norm_stats_target,  # type: ignore[attr-defined]
         )
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        return optimizers if self.ent_coef_optimizer is None else [*optimizers, self.ent_coef_optimizer]
+
+    def _prepare_execution(self) -> None:
+        """Make networks and optimizers ready for how updates are executed; again after anything replaced them."""
+        train_freq: Any = self.train_freq  # a TrainFreq since SB3's _setup_model
+        by_step = train_freq.unit == TrainFrequencyUnit.STEP
+        if self.overlap and not by_step:
+            raise ConfigError(
+                "overlap=True needs train_freq in steps: how many updates an episode is worth is known when it ends."
+            )
+        self._plan: ExecutionPlan = plan_execution(
+            self.execution_config,
+            self.device,
+            tasks_are_named=self.is_multi_task,
+            can_capture=self._uses_task_buffer() and self._vec_normalize_env is None,
+            can_overlap=by_step,
+        )
+        execution = self._plan.execution
+        set_arithmetic(self.policy, execution == "fused", "bf16" if self._plan.bf16 else "fp32")
+        for optimizer in self._optimizers():
+            prepare_optimizer_(optimizer, execution != "eager", capturable=execution == "cudagraph")
+        self._update_state = self._make_update_state()
+        self._captured_updates: CapturedCalls[Metrics] = CapturedCalls()
+        self._captured_actor: CapturedActor | None = None
+        self._stepping_env: WorkWhileStepping | None = None
 
     def _make_objective(self) -> Objective:
         """Return SAC's or TQC's objective."""
@@ -334,6 +406,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._check_tasks(wrapped, self.task_names)
         super().set_env(wrapped, force_reset)
         self._read_tasks(self.env)
+        self._prepare_execution()
         if isinstance(self.replay_buffer, TaskReplayBuffer):
             self.replay_buffer.set_task_of_env(self.task_of_env)
 
@@ -359,6 +432,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :raises ConfigError: before the first step, if the options do not fit the run
         """
         _check_learn(total_timesteps, log_interval)
+        self._updates_are_done = False
         super().learn(
             total_timesteps=int(total_timesteps),
             callback=callback,
@@ -424,18 +498,71 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             given = CallbackList([ARSCallback(), *others])
         return super()._init_callback(given, progress_bar)
 
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """Collect as SB3 does; with ``overlap``, the updates that the data so far is worth run in the first step.
+
+        So every call begins and ends with all updates done and no step under way. Beside serial execution the newest
+        transition is seen one update later, and the last one of ``learn()`` is not trained on.
+
+        :param env: to step
+        :param callback: SB3's
+        :param train_freq: SB3's
+        :param replay_buffer: to write
+        :param action_noise: SB3's
+        :param learning_starts: SB3's
+        :param log_interval: SB3's
+        """
+        if self._stepping_env is None or self._stepping_env.venv is not env:
+            self._stepping_env = WorkWhileStepping(env)
+        self._stepping_env.timer = self.timer
+        self._stepping_env.work = partial(self._train_for, train_freq) if self._plan.overlap else None
+        self._updates_are_done = False
+        rollout = super().collect_rollouts(
+            self._stepping_env,
+            callback,
+            train_freq,
+            replay_buffer,
+            action_noise,
+            learning_starts,
+            log_interval,
+        )
+        self._updates_are_done = self._plan.overlap and rollout.continue_training
+        return rollout
+
+    def _train_for(self, train_freq: TrainFreq) -> None:
+        """Do the updates that one rollout is worth."""
+        gradient_steps = (
+            self.gradient_steps if self.gradient_steps >= 0 else train_freq.frequency * self.n_envs
+        )
+        if self.num_timesteps > self.learning_starts and gradient_steps > 0:
+            self.train(gradient_steps, self.batch_size)
+
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         try:
-            return super()._sample_action(learning_starts, action_noise, n_envs)
-        except ValueError as error:  # torch's Normal refuses a mean of NaN
+            with self.timer("act"):
+                actions, buffer_actions = super()._sample_action(learning_starts, action_noise, n_envs)
+                # torch's Normal refuses a mean of NaN, unless something in the process has used torch.compile
+                if not np.isfinite(buffer_actions).all():
+                    raise ValueError("the actor gave NaN or infinity")
+        except ValueError as error:
             if all(th.isfinite(parameter).all() for parameter in self.actor.parameters()):
                 raise
             raise DivergedError(
                 f"The policy holds NaN or infinity at step {self.num_timesteps}. Continue from an earlier save with a "
                 "smaller learning_rate or smaller rewards."
             ) from error
+        return actions, buffer_actions
 
     def _store_transition(
         self,
@@ -446,9 +573,10 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        self._check_finite("observation", new_obs)
-        self._check_finite("reward", reward)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        with self.timer("store"):
+            self._check_finite("observation", new_obs)
+            self._check_finite("reward", reward)
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _check_finite(self, what: str, values: np.ndarray | dict[str, np.ndarray]) -> None:
         """Raise before a NaN or an infinity reaches the buffer."""
@@ -476,31 +604,57 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param gradient_steps: how many
         :param batch_size: rows per task
         """
+        if self._updates_are_done:  # learn() asks after each rollout
+            self._updates_are_done = False
+            return
         if not self.has_batch():
             self._warn_of_waiting()
             return
-        assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
-        optimizers = [self.actor.optimizer, self.critic.optimizer]
-        if self.ent_coef_optimizer is not None:
-            optimizers.append(self.ent_coef_optimizer)
-        self._update_learning_rate(optimizers)
+        self._update_learning_rate(self._optimizers())
         hyperparameters = Hyperparameters(
             self.gamma, self.tau, float(self.target_entropy), self._make_objective()
         )
-        for _ in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            metrics = update(
-                self._update_state,
-                batch,
-                self._draw_noise(batch.actions),
-                self.reward_scale,
-                hyperparameters,
+        with tf32(self._plan.tf32):
+            for _ in range(gradient_steps):
                 # counted over the whole run; SB3 2.9.2 counts within one train() call (sac.py), so 1 step never waits
-                update_target=self._n_updates % self.target_update_interval == 0,
-            )
-            self._n_updates += 1
-            self._task_log.add_update(metrics)
+                update_target = self._n_updates % self.target_update_interval == 0
+                metrics = self._execute(hyperparameters, batch_size, update_target)
+                self._n_updates += 1
+                with self.timer("log"):
+                    self._task_log.add_update(metrics)
+
+    def _execute(self, hyperparameters: Hyperparameters, batch_size: int, update_target: bool) -> Metrics:
+        """Run one update as planned."""
+        if self._plan.execution != "cudagraph":
+            return self._sample_and_update(hyperparameters, batch_size, update_target, self.timer)
+        step = partial(self._sample_and_update, hyperparameters, batch_size, update_target, nullcontext)
+        buffer: Any = self.replay_buffer
+        frozen = (hyperparameters, batch_size, id(buffer), buffer.storage_version)
+        with self.timer("update"):
+            return self._captured_updates(step, update_target, frozen, [buffer.generator])
+
+    def _sample_and_update(
+        self, hyperparameters: Hyperparameters, batch_size: int, update_target: bool, timer: Timer
+    ) -> Metrics:
+        assert self.replay_buffer is not None
+        with timer("sample"):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        noise = self._draw_noise(batch.actions)
+        return update(
+            self._update_state, batch, noise, self.reward_scale, hyperparameters, update_target, timer
+        )
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        """Set the learning rate, as SB3 does, but in place where it lives on the device."""
+        learning_rate = self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", learning_rate)
+        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
+            for group in optimizer.param_groups:
+                if isinstance(group["lr"], th.Tensor):
+                    group["lr"].fill_(learning_rate)
+                else:
+                    group["lr"] = learning_rate
 
     def _draw_noise(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return standard normal noise for the actions at s and at s', in the order SB3 draws it."""
@@ -585,13 +739,14 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self.num_timesteps == self._last_dump_at:
             return  # SB3 asks once per ended episode, and the horizons of several tasks end together
         self._last_dump_at = self.num_timesteps
-        self._task_log.record(self.logger, self._n_updates, self.log_ent_coef is not None)
-        if self.is_multi_task:
-            assert isinstance(self.replay_buffer, TaskReplayBuffer)
-            self._task_log.record_scale(
-                self.logger, self.reward_scale.scale, self.replay_buffer.reward_statistics().mean
-            )
-        super().dump_logs()
+        with self.timer("log"):
+            self._task_log.record(self.logger, self._n_updates, self.log_ent_coef is not None)
+            if self.is_multi_task:
+                assert isinstance(self.replay_buffer, TaskReplayBuffer)
+                self._task_log.record_scale(
+                    self.logger, self.reward_scale.scale, self.replay_buffer.reward_statistics().mean
+                )
+            super().dump_logs()
 
     # ------------------------------------------------------------------ prediction, saving, loading
 
@@ -618,7 +773,33 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             raise ConfigError(
                 "The observation lacks the one-hot task id; say which task it is from with task=."
             )
+        if self._plan.execution == "cudagraph" and _same_shape(observation, self._last_obs):
+            return self._predict_captured(observation, deterministic), state
         return super().predict(observation, state, episode_start, deterministic)
+
+    def _predict_captured(self, observation: Any, deterministic: bool) -> np.ndarray:
+        """Return actions for one observation of each environment through the captured actor."""
+        if self._captured_actor is None:
+            shape = (*observation.shape, *(self.action_space.shape or ()))
+            self._captured_actor = CapturedActor(self.actor, shape, self.device)
+        self.policy.set_training_mode(False)
+        with tf32(self._plan.tf32):
+            return self.policy.unscale_action(self._captured_actor(observation, deterministic))
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """Load parameters, as SB3 does.
+
+        :param load_path_or_dict: SB3's
+        :param exact_match: SB3's
+        :param device: SB3's
+        """
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        self._prepare_execution()  # the optimizers took over options of the machine that saved them
 
     def _lacks_task_id(self, observation: Any) -> bool:
         width = self.observation_space.shape
@@ -662,33 +843,46 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             _check_saved_tasks(path, task_names_of(env))
         return super().load(path, env=env, **kwargs)
 
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Save the replay buffer, as SB3 does; with several tasks straight from memory, without a second copy.
+
+        :param path: where to; without a suffix it gets ``.pkl``
+        """
+        if not isinstance(self.replay_buffer, TaskReplayBuffer):
+            super().save_replay_buffer(path)
+            return
+        with _opened(path, "w", self.verbose) as file:
+            self.replay_buffer.write_to(file)
+
     def load_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True
     ) -> None:
-        """Load a replay buffer, as SB3 does; it must hold the model's tasks.
+        """Load a replay buffer, as SB3 does; it must hold the model's tasks. With several, it is read into place.
 
         :param path: what ``save_replay_buffer`` wrote
         :param truncate_last_traj: SB3's, for hindsight buffers
-        :raises ConfigError: if its tasks differ; the model keeps the buffer it had
+        :raises ConfigError: if its tasks differ, or it was cut off; the model keeps the buffer it had
         """
         kept = self.replay_buffer
-        try:
-            super().load_replay_buffer(path, truncate_last_traj)
-            self._check_loaded_buffer(path)
-        except Exception:
-            self.replay_buffer = kept
-            raise
-        if isinstance(self.replay_buffer, TaskReplayBuffer):
-            self.replay_buffer.set_task_of_env(self.task_of_env)
+        with _opened(path, "r", self.verbose) as file:
+            if isinstance(kept, TaskReplayBuffer):
+                kept.read_from(file)
+                return
+            try:
+                super().load_replay_buffer(file, truncate_last_traj)
+                self._check_loaded_buffer(path)
+            except pickle.UnpicklingError as error:
+                raise ConfigError(
+                    f"{path} is no pickled replay buffer of a plain environment ({error}). A buffer of several tasks "
+                    "loads into a model of those tasks."
+                ) from error
+            except Exception:
+                self.replay_buffer = kept
+                raise
 
     def _check_loaded_buffer(self, path: Any) -> None:
         buffer = self.replay_buffer
         assert buffer is not None
-        loaded = list(getattr(buffer, "task_names", ())) or None
-        if self.is_multi_task and self._uses_task_buffer() and loaded != self.task_names:
-            raise ConfigError(
-                f"The replay buffer in {path} holds the tasks {loaded}, this model has {self.task_names}."
-            )
         spaces = (buffer.observation_space.shape, buffer.action_space.shape)
         if spaces != (self.observation_space.shape, self.action_space.shape):
             raise ConfigError(
@@ -697,7 +891,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_update_state", "_task_log", "reward_scale"]
+        ours = ["_update_state", "_task_log", "reward_scale", "timer", "_plan"]
+        captured = ["_captured_updates", "_captured_actor", "_stepping_env"]
+        return [*super()._excluded_save_params(), *ours, *captured]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
@@ -716,6 +912,17 @@ def task_names_of(env: GymEnv) -> list[str] | None:
     """Return the names of a multi-task environment's tasks, ``None`` for a plain one."""
     names = getattr(env, "task_names", None)
     return None if names is None else list(names)
+
+
+@contextmanager
+def _opened(path: str | pathlib.Path | io.BufferedIOBase, mode: str, verbose: int) -> Iterator[Any]:
+    """Open a replay buffer's file as SB3 does, and close it unless the caller opened it."""
+    file = open_path(path, mode, verbose=verbose, suffix="pkl")
+    try:
+        yield file
+    finally:
+        if file is not path:
+            file.close()
 
 
 def _check_saved_tasks(path: str | pathlib.Path | io.BufferedIOBase, names: list[str] | None) -> None:
@@ -737,6 +944,10 @@ def _check_saved_tasks(path: str | pathlib.Path | io.BufferedIOBase, names: list
             f"{path} was trained on {_describe(saved)}, but the environment has {_describe(names)}. Make the "
             "environment with the model's task list, in its order, or load without env to predict."
         )
+
+
+def _same_shape(a: object, b: object) -> bool:
+    return isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and a.shape == b.shape
 
 
 def _describe(names: list[str] | None) -> str:

@@ -45,7 +45,10 @@ class TaskLog:
 
     def add_update(self, metrics: Metrics) -> None:
         """Add one update's metrics to the running sums, on the device."""
-        self._sums = metrics if self._sums is None else Metrics(*map(th.add, self._sums, metrics))
+        if self._sums is None:  # a copy: a captured update writes into the same tensors again
+            self._sums = Metrics(*(metric.clone() for metric in metrics))
+        else:
+            th._foreach_add_(self._sums, metrics)
         self._n_updates += 1
 
     def record(self, logger: Logger, n_updates: int, temperature_is_learned: bool) -> None:

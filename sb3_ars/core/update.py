@@ -5,8 +5,9 @@ It reads no counter, logger or generator, never waits for the device, and gives 
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -17,7 +18,7 @@ from sb3_ars.core.reward_scale import RewardScale
 from sb3_ars.core.targets import soft_target
 from sb3_ars.core.temperature import per_row, temperature_loss
 
-__all__ = ["Batch", "Hyperparameters", "Metrics", "UpdateState", "squashed_gaussian", "update"]
+__all__ = ["Batch", "Hyperparameters", "Metrics", "Timer", "UpdateState", "squashed_gaussian", "update"]
 
 
 class Actor(Protocol):
@@ -32,6 +33,9 @@ class Critic(Protocol):
 
     def q_values(self, obs: Any, actions: th.Tensor) -> th.Tensor:
         """Return ``(rows, n_critics, n_outputs)``."""
+
+    def parameters(self) -> Iterable[th.Tensor]:
+        """Return what the critic optimizer steps, in the same order in critics and target critics."""
 
 
 class Batch(Protocol):
@@ -90,7 +94,6 @@ class UpdateState:
     norm_statistics_target: Sequence[th.Tensor] = ()
 
     def __post_init__(self) -> None:
-        assert isinstance(self.critic, th.nn.Module) and isinstance(self.critic_target, th.nn.Module)
         self.critic_parameters: list[th.Tensor] = list(self.critic.parameters())
         self.target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
 
@@ -109,6 +112,13 @@ class Hyperparameters:
     tau: float
     target_entropy: float
     objective: Objective
+
+
+class Timer(Protocol):
+    """Measures parts of a run; ``contextlib.nullcontext`` measures nothing."""
+
+    def __call__(self, part: str, /) -> contextlib.AbstractContextManager[Any]:
+        """Return a context in which the named part runs."""
 
 
 class Metrics(NamedTuple):
@@ -130,6 +140,7 @@ def update(
     reward_scale: RewardScale,
     hyperparameters: Hyperparameters,
     update_target: bool = True,
+    timer: Timer = contextlib.nullcontext,
 ) -> Metrics:
     """Change ``state`` by one gradient step on ``batch``.
 
@@ -141,40 +152,45 @@ def update(
     :param reward_scale: c_i
     :param hyperparameters: constants
     :param update_target: whether the target critics move in this step
+    :param timer: told which part is running: "actor", "critic", "targets"
 
     Source: paper, Eq. 3, 4 and 7; with one task, c = 1 and SB3's networks it is SB3's ``SAC.train``, or sb3-contrib's
     ``TQC.train``, to the bit.
     """
     objective = hyperparameters.objective
     n_rows = batch.rewards.shape[0]
-    actions_pi, log_prob = squashed_gaussian(state.actor, batch.observations, noise[0])
+    with timer("actor"):
+        actions_pi, log_prob = squashed_gaussian(state.actor, batch.observations, noise[0])
+        ent_coef, ent_coef_loss = _step_temperature(state, log_prob, hyperparameters.target_entropy)
+        row_ent_coef = per_row(ent_coef, n_rows)
 
-    ent_coef, ent_coef_loss = _step_temperature(state, log_prob, hyperparameters.target_entropy)
-    row_ent_coef = per_row(ent_coef, n_rows)
+    with timer("critic"):
+        with th.no_grad():
+            next_actions, next_log_prob = squashed_gaussian(state.actor, batch.next_observations, noise[1])
+            next_q = state.critic_target.q_values(batch.next_observations, next_actions)
+            discount = hyperparameters.discount if batch.discounts is None else batch.discounts
+            target = soft_target(
+                batch.rewards,
+                batch.dones,
+                discount,
+                objective.next_value(next_q),
+                row_ent_coef,
+                next_log_prob,
+                reward_scale,
+            )
+        q = state.critic.q_values(batch.observations, batch.actions)
+        critic_loss = objective.loss(q, target).mean()
+        _step(state.critic_optimizer, critic_loss)
 
-    with th.no_grad():
-        next_actions, next_log_prob = squashed_gaussian(state.actor, batch.next_observations, noise[1])
-        next_q = state.critic_target.q_values(batch.next_observations, next_actions)
-        discount = hyperparameters.discount if batch.discounts is None else batch.discounts
-        target = soft_target(
-            batch.rewards,
-            batch.dones,
-            discount,
-            objective.next_value(next_q),
-            row_ent_coef,
-            next_log_prob,
-            reward_scale,
-        )
-    q = state.critic.q_values(batch.observations, batch.actions)
-    critic_loss = objective.loss(q, target).mean()
-    _step(state.critic_optimizer, critic_loss)
+    with timer("actor"):
+        with _frozen(state.critic_parameters):
+            q_pi = state.critic.q_values(batch.observations, actions_pi)
+        actor_loss = (row_ent_coef * log_prob - objective.actor_value(q_pi)).mean()
+        _step(state.actor_optimizer, actor_loss)
 
-    q_pi = state.critic.q_values(batch.observations, actions_pi)
-    actor_loss = (row_ent_coef * log_prob - objective.actor_value(q_pi)).mean()
-    _step(state.actor_optimizer, actor_loss)
-
-    if update_target:
-        _move_target(state, hyperparameters.tau)
+    with timer("targets"):
+        if update_target:
+            _move_target(state, hyperparameters.tau)
     n_tasks = reward_scale.scale.shape[0]
     return Metrics(
         actor_loss.detach(),
@@ -228,6 +244,19 @@ def _step(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient
     optimizer.step()
+
+
+@contextlib.contextmanager
+def _frozen(parameters: Sequence[th.Tensor]) -> Iterator[None]:
+    """Record no gradient of these parameters: the actor's loss needs the critics' gradient by the action alone."""
+    learned = [parameter for parameter in parameters if parameter.requires_grad]
+    for parameter in learned:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learned:
+            parameter.requires_grad_(True)
 
 
 @th.no_grad()

@@ -23,7 +23,7 @@ _BENCHMARKS = ("MT10", "MT25", "MT50")
 
 
 class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
-    """One Meta-World task, goal visible: the stock simulator, unpatched, with goals that obey the seed.
+    """One Meta-World task, goal visible, with goals that obey the seed.
 
     Observation ``(39,)`` float64, action ``(4,)`` in [-1, 1], reward per ``reward_version``; never
     terminates, is truncated after ``max_episode_steps``; ``info["success"]`` is 0.0 or 1.0 in each step.
@@ -33,8 +33,7 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
 
     :param task: "reach-v3" or "reach"
     :param goals: "random": a new goal and object position in each episode; "stored": each episode picks one
-        of
-        ``n_goals`` at random; "ordered": they come one after another, from the first again after a seeded
+        of ``n_goals`` at random; "ordered": they come one after another, from the first again after a seeded
         reset
     :param max_episode_steps: the horizon
     :param reward_version: "v2" (0 to 10) or "v1"
@@ -43,6 +42,7 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
     :param first_goal: "ordered" starts at this goal
     :param goal_stride: "ordered" goes on by this many goals
     :param render_mode: None, "rgb_array", "human" or "depth_array"
+    :param fast: step through `fast_metaworld`, which gives the same numbers sooner; False is the stock env
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # Gymnasium's is not a ClassVar
@@ -61,6 +61,7 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
         first_goal: int = 0,
         goal_stride: int = 1,
         render_mode: str | None = None,
+        fast: bool = True,
     ) -> None:
         self.task = task if task.endswith("-v3") else f"{task}-v3"
         self.goals = goals
@@ -70,13 +71,16 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
         self._first_goal, self._stride = first_goal, goal_stride
         self._next_goal = first_goal
         self.sawyer: Any = _new_sawyer(
-            self.task, reward_function_version=reward_version, render_mode=render_mode
+            self.task, fast, reward_function_version=reward_version, render_mode=render_mode
         )
-        """The stock env."""
+        """The stock env, or the fast subclass of it."""
         self.sawyer._partially_observable = False
         # Cached while the goal was still hidden.
         del self.sawyer.sawyer_observation_space
         self.sawyer.max_path_length = max_episode_steps
+        self._draw = self.sawyer.place if fast else self.sawyer.reset_model
+        if fast:
+            self.sawyer.remember = self._stored is not None
         self.observation_space = self.sawyer.sawyer_observation_space
         self.action_space = self.sawyer.action_space
 
@@ -101,7 +105,7 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
             # The env must draw for itself: it rejects some vectors, and would loop for ever on a frozen one.
             sawyer.np_random = self.np_random
             sawyer._freeze_rand_vec = False
-            sawyer.reset_model()
+            self._draw()
             vector = sawyer._last_rand_vec
         else:
             vector = self._stored[self._pick(len(self._stored))]
@@ -148,6 +152,7 @@ def make_metaworld_env(
     start_method: str = "spawn",
     worker_timeout: float = 30.0,
     render_mode: str | None = None,
+    fast: bool = True,
 ) -> MultiTaskVecEnv:
     """Return a VecEnv of Meta-World tasks: goals visible, rewards raw, one-hot task id in the observation.
 
@@ -164,6 +169,7 @@ def make_metaworld_env(
     :param start_method: see `MultiTaskVecEnv`
     :param worker_timeout: see `MultiTaskVecEnv`
     :param render_mode: None, "rgb_array", "human" or "depth_array"
+    :param fast: see `MetaworldTask`
     :raises ConfigError: if an option or a name cannot work; the message names it
     :raises ImportError: if Meta-World is not installed
     """
@@ -173,6 +179,8 @@ def make_metaworld_env(
 
     checks.check_choice("goals", goals, ("random", "stored", "ordered"))
     checks.check_choice("reward_version", reward_version, ("v2", "v1"))
+    if not isinstance(fast, bool):
+        raise ConfigError(f"fast={fast!r} must be True or False.")
     per_task = checks.check_count("n_envs_per_task", n_envs_per_task)
     checks.check_count("n_goals", n_goals)
     if checks.check_seed(goal_seed, "goal_seed") is None or goal_seed >= 2**32:
@@ -188,6 +196,7 @@ def make_metaworld_env(
         goal_seed=goal_seed,
         goal_stride=per_task,
         render_mode=render_mode,
+        fast=fast,
     )
     names = metaworld_task_names(tasks)
     env = MultiTaskVecEnv(
@@ -255,9 +264,13 @@ def _env_dict() -> Any:
     return env_dict
 
 
-def _new_sawyer(task: str, **options: Any) -> Any:
-    env_dict = _env_dict()
-    sawyer = env_dict.ALL_V3_ENVIRONMENTS[task](**options)
+def _new_sawyer(task: str, fast: bool, **options: Any) -> Any:
+    env_class = _env_dict().ALL_V3_ENVIRONMENTS[task]
+    if fast:
+        from sb3_ars.envs.fast_metaworld import fast_class  # needs Meta-World
+
+        env_class = fast_class(env_class)
+    sawyer = env_class(**options)
     # What set_task does for a task without settings of its own; none of the fifty has any.
     sawyer._set_task_called = True
     sawyer._set_task_inner()
@@ -270,14 +283,16 @@ def _new_sawyer(task: str, **options: Any) -> Any:
 def _stored_goals(task: str, n_goals: int, goal_seed: int) -> npt.NDArray[np.float64]:
     """Return ``(n_goals, width)`` reset vectors, the first of ``metaworld.MT1(task, seed=goal_seed)``'s 50.
 
-    Cached per process: each costs a full reset, and the envs of one task share them.
+    Cached per process: the envs of one task share them.
     """
-    sawyer = _new_sawyer(task)
+    sawyer = _new_sawyer(task, fast=True)
     # Meta-World seeds NumPy's global generator and draws from that; this one gives the same numbers.
     sawyer.np_random = np.random.RandomState(goal_seed)
     vectors = []
     for _ in range(n_goals):
-        sawyer.reset()
+        # Meta-World keeps the second draw of a reset.
+        sawyer.place()
+        sawyer.place()
         vectors.append(np.array(sawyer._last_rand_vec, dtype=np.float64))
     sawyer.close()
     stored = np.array(vectors)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import mmap
 import multiprocessing
 import os
@@ -15,8 +16,7 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from multiprocessing import connection
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal, NamedTuple, NoReturn, Protocol
@@ -239,7 +239,7 @@ class TaskEnvs:
         infos = []
         for index, (seed, option) in enumerate(zip(seeds, options, strict=True)):
             infos.append(self._reset_env(index, seed, dict(option) or None))
-        self._check_finite(range(len(self._envs)), "reset")
+        self._check_finite([], "reset")
         return infos
 
     def step_async(self) -> None:
@@ -248,21 +248,24 @@ class TaskEnvs:
     def step_wait(self) -> list[Ended]:
         """Step every env with its row of ``arrays.actions``; return the episodes that ended."""
         arrays = self.arrays
+        # A copy, because the next step overwrites the rows and an env may keep its last action.
+        actions = arrays.actions.copy()
+        outcomes = []  # written at once: an assignment to one element of an array costs as much as to all
         ended: list[Ended] = []
         for index, env in enumerate(self._envs):
             self.current = index
-            # A copy, because the next step overwrites the row and an env may keep its last action.
-            obs, reward, terminated, truncated, info = env.step(arrays.actions[index].copy())
-            arrays.rewards[index] = reward
-            self._returns[index] += float(reward)
+            obs, reward, terminated, truncated, info = env.step(actions[index])
+            reward = float(reward)
+            success = self._note_success(index, info)
+            self._returns[index] += reward
             self._lengths[index] += 1
-            self._note_success(index, info)
-            arrays.terminated[index] = terminated
-            arrays.truncated[index] = truncated
+            outcomes.append((reward, terminated, truncated, success))
             if terminated or truncated:
                 ended.append(Ended(index, dict(info), self._end_episode(index, obs)))
             else:
                 self._store(arrays.obs, index, obs, "step")
+        columns = zip(*outcomes, strict=True)
+        arrays.rewards[:], arrays.terminated[:], arrays.truncated[:], arrays.success[:] = columns
         self._check_finite([end.env for end in ended], "step")
         return ended
 
@@ -300,41 +303,42 @@ class TaskEnvs:
         arrays.success_once[index] = self._once[index]
         return self._reset_env(index, None, None)
 
-    def _note_success(self, index: int, info: Mapping[str, Any]) -> None:
+    def _note_success(self, index: int, info: Mapping[str, Any]) -> float:
         value = info.get("success", info.get("is_success"))
         if value is None:
-            self.arrays.success[index] = np.nan
-            return
+            return math.nan
         success = float(value)
-        self.arrays.success[index] = success
         if success > 0.0:
             self._once[index] = 1.0
         elif self._once[index] != 1.0:
             self._once[index] = 0.0
+        return success
 
     def _store(self, into: npt.NDArray[np.float32], index: int, obs: Any, where: str) -> None:
         # Assignment would broadcast a scalar or a length of 1 without a word.
-        if np.shape(obs) != into.shape[1:]:
+        shape = obs.shape if type(obs) is np.ndarray else np.shape(obs)
+        if shape != into.shape[1:]:
             raise EnvContractError(
-                f"Task {self._tasks[index]!r}: {where}() returned an observation of shape {np.shape(obs)}, "
+                f"Task {self._tasks[index]!r}: {where}() returned an observation of shape {shape}, "
                 f"but its observation_space has shape {into.shape[1:]}. Make the env return what it declares."
             )
         into[index] = obs
 
     def _check_finite(self, ended: Sequence[int], where: str) -> None:
         arrays = self.arrays
-        finite = np.isfinite(arrays.obs).all(axis=1)
-        if where == "step":
-            finite &= np.isfinite(arrays.rewards)
-            for index in ended:
-                finite[index] &= np.isfinite(arrays.terminal_obs[index]).all()
-        if not finite.all():
-            bad = sorted({self._tasks[index] for index in np.flatnonzero(~finite)})
-            raise EnvContractError(
-                f"Task {', '.join(map(repr, bad))}: {where}() returned NaN or infinity in the observation "
-                "or the reward. One such number spoils the networks of all tasks; end the episode before "
-                "it arises."
-            )
+        finite = np.isfinite(arrays.obs)
+        rewards = np.isfinite(arrays.rewards) if where == "step" else np.ones(len(finite), bool)
+        last = np.isfinite(arrays.terminal_obs[ended])
+        if finite.all() and rewards.all() and last.all():
+            return
+        good = finite.all(axis=1) & rewards
+        good[ended] &= last.all(axis=1)
+        bad = sorted({self._tasks[index] for index in np.flatnonzero(~good)})
+        raise EnvContractError(
+            f"Task {', '.join(map(repr, bad))}: {where}() returned NaN or infinity in the observation "
+            "or the reward. One such number spoils the networks of all tasks; end the episode before "
+            "it arises."
+        )
 
     @staticmethod
     def _get_attr(env: gym.Env[Any, Any], name: str) -> Any:
@@ -366,6 +370,9 @@ class TaskEnvs:
 class WorkerPool:
     """The same as `TaskEnvs`, in ``n_workers`` processes that each own a contiguous run of the envs.
 
+    A step goes through shared memory and two semaphores per worker; nothing is pickled but the infos of episodes
+    that ended. Everybody sleeps who has nothing to do: the processors are the learner's too.
+
     A dead, raising or hanging worker becomes a `WorkerError` that names its tasks, and ends all the others.
 
     :param factories: one per env; they travel by cloudpickle, so lambdas and classes of a notebook will do
@@ -393,10 +400,10 @@ class WorkerPool:
         self._awaiting: set[int] = set()
         self._replies: dict[int, bytes] = {}
         self._processes: list[BaseProcess] = []
-        self._conns: list[Connection] = []
+        self._lines: list[_Line] = []
         pickled = _pickle_factories(factories, tasks)
         # Both a finalizer (the pool was dropped) and an exit handler (the script ended).
-        self._end = weakref.finalize(self, _end_workers, self._processes, self._conns, os.getpid())
+        self._end = weakref.finalize(self, _end_workers, self._processes, self._lines, os.getpid())
         try:
             self._start(pickled, start_method)
         except BaseException:
@@ -436,19 +443,20 @@ class WorkerPool:
         return self._take_lists()
 
     def step_async(self) -> None:
-        """Begin the step of ``arrays.actions``: one byte to each worker."""
+        """Begin the step of ``arrays.actions``."""
         self._settle()
-        for worker in range(len(self._chunks)):
-            self._send(worker, _STEP)
+        for worker, line in enumerate(self._lines):
+            line.ask(_STEP)
+            self._awaiting.add(worker)
 
     def step_wait(self) -> list[Ended]:
         """Wait for the step; return the episodes that ended, env indices over the whole pool."""
         self._collect(self._timeout, "stepping its envs")
         ended: list[Ended] = []
-        for worker, chunk in enumerate(self._chunks):
-            reply = self._replies.pop(worker)
-            if reply != _DONE:
-                ended += [end._replace(env=end.env + chunk.start) for end in pickle.loads(reply[1:])]
+        for worker, reply in sorted(self._replies.items()):
+            start = self._chunks[worker].start
+            ended += [end._replace(env=end.env + start) for end in pickle.loads(reply[1:])]
+        self._replies.clear()
         return ended
 
     def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
@@ -461,7 +469,7 @@ class WorkerPool:
         wanted = {w: [i for i in indices if i in chunks[w]] for w in {self._worker_of[i] for i in indices}}
         for worker, chosen in wanted.items():
             local = [index - chunks[worker].start for index in chosen]
-            self._send(worker, _COMMAND + _dumps(("call", (command, local, *args))))
+            self._send(worker, ("call", (command, local, *args)))
         self._collect(self._timeout, f"answering {command}", fatal=False)
         answers: dict[int, Any] = {}
         replies = {worker: self._replies.pop(worker) for worker in wanted}
@@ -485,13 +493,17 @@ class WorkerPool:
         with _hidden_main(), _single_threaded():
             for number, chunk in enumerate(self._chunks):
                 ours, theirs = context.Pipe()
+                line = _Line(ours, context.Semaphore(0), context.Semaphore(0), context.RawArray("B", 2))
                 # A forked child holds copies of the pipes before it and would keep them open after the parent
                 # died.
-                stale = [*self._conns, ours] if start_method == "fork" else []
-                self._conns.append(ours)
+                stale = [line.conn for line in self._lines] + [ours] if start_method == "fork" else []
+                self._lines.append(line)
                 envs = TaskEnvs(factories[chunk.start : chunk.stop], self._tasks[chunk.start : chunk.stop])
                 process = context.Process(
-                    target=_work, args=(theirs, stale, envs), name=f"sb3_ars-envs-{number}", daemon=True
+                    target=_work,
+                    args=(replace(line, conn=theirs), stale, envs),
+                    name=f"sb3_ars-envs-{number}",
+                    daemon=True,
                 )
                 process.start()
                 self._processes.append(process)
@@ -505,7 +517,7 @@ class WorkerPool:
     def _send_all(self, messages: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
         self._settle()
         for worker, message in enumerate(messages):
-            self._send(worker, _COMMAND + _dumps(message))
+            self._send(worker, message)
 
     def _settle(self) -> None:
         """Throw away answers of a command that was interrupted (Ctrl-C) between sending and receiving."""
@@ -513,9 +525,12 @@ class WorkerPool:
             self._collect(self._timeout, "finishing an interrupted command", fatal=False)
         self._replies.clear()
 
-    def _send(self, worker: int, message: bytes) -> None:
+    def _send(self, worker: int, message: tuple[str, tuple[Any, ...]]) -> None:
+        line, data = self._lines[worker], _dumps(message)
+        # In this order, because a long message is taken only while it is read.
+        line.ask(_COMMAND)
         try:
-            self._conns[worker].send_bytes(message)
+            line.conn.send_bytes(data)
         except OSError:
             self._fail_dead(worker, "before it could be asked")
         self._awaiting.add(worker)
@@ -523,26 +538,29 @@ class WorkerPool:
     def _collect(self, timeout: float, doing: str, fatal: bool = True) -> None:
         deadline = time.monotonic() + timeout
         while self._awaiting:
-            sources: dict[Any, int] = {self._conns[worker]: worker for worker in self._awaiting}
-            sources.update({self._processes[worker].sentinel: worker for worker in self._awaiting})
-            ready = connection.wait(list(sources), max(0.0, deadline - time.monotonic()))
-            if not ready:
+            first, *others = sorted(self._awaiting)
+            if self._lines[first].done.acquire(timeout=_LOOK_AROUND):
+                self._receive(first, doing, fatal)
+                continue
+            dead = {worker for worker in self._awaiting if not self._processes[worker].is_alive()}
+            for worker in [first, *others]:
+                if self._lines[worker].done.acquire(block=False):
+                    self._receive(worker, doing, fatal)
+                elif worker in dead:
+                    self._fail_dead(worker, f"while {doing}")
+            if self._awaiting and time.monotonic() > deadline:
                 self._fail_hung(timeout, doing)
-            for worker in {sources[source] for source in ready}:
-                self._receive(worker, doing, fatal)
 
     def _receive(self, worker: int, doing: str, fatal: bool) -> None:
-        conn = self._conns[worker]
-        try:
-            reply = conn.recv_bytes() if conn.poll() else None
-        except (EOFError, OSError):
-            reply = None
-        if reply is None:
-            self._fail_dead(worker, f"while {doing}")
+        line = self._lines[worker]
+        if line.words[_ANSWER] == _REPLY:
+            try:
+                self._replies[worker] = line.conn.recv_bytes()
+            except (EOFError, OSError):
+                self._fail_dead(worker, f"while {doing}")
         self._awaiting.discard(worker)
-        self._replies[worker] = reply
-        if fatal and reply[:1] == _ERROR:
-            self._fail_raised(reply, doing)
+        if fatal and self._replies.get(worker, b"")[:1] == _ERROR:
+            self._fail_raised(self._replies[worker], doing)
 
     def _take_lists(self) -> list[Any]:
         parts = [pickle.loads(self._replies.pop(worker)[1:]) for worker in range(len(self._chunks))]
@@ -595,7 +613,7 @@ class WorkerPool:
 
     def _fail(self, message: str) -> NoReturn:
         # Ended without asking: one of them is known not to answer.
-        _end_workers(self._processes, self._conns, os.getpid(), grace=0.0)
+        _end_workers(self._processes, self._lines, os.getpid(), grace=0.0)
         raise WorkerError(f"{message} All env workers were ended; build the env again.")
 
 
@@ -615,8 +633,35 @@ class TimeLimited:
         return gym.wrappers.TimeLimit(self.factory(), self.max_episode_steps)
 
 
-_STEP, _COMMAND, _CLOSE = b"s", b"c", b"q"
-_DONE, _RESULT, _ERROR = b"d", b"r", b"e"
+_STEP, _COMMAND, _CLOSE = 1, 2, 3  # what is asked
+_DONE, _REPLY = 1, 2  # what is answered: nothing to add, or something in the pipe
+_RESULT, _ERROR = b"r", b"e"  # what that begins with
+_QUESTION, _ANSWER = 0, 1  # who writes which of a line's words
+
+_LOOK_AROUND = 0.1
+"""Seconds between two looks at whether the other side still lives, while waiting for it."""
+
+
+@dataclass(frozen=True)
+class _Line:
+    """What the parent and one worker meet through: wake-ups, a word each way, and a pipe for what is longer."""
+
+    conn: Connection
+    go: Any
+    done: Any
+    words: Any
+
+    def ask(self, question: int) -> None:
+        """Wake the worker."""
+        self.words[_QUESTION] = question
+        self.go.release()
+
+    def answer(self, reply: bytes) -> None:
+        """Wake the parent."""
+        self.words[_ANSWER] = _REPLY if reply else _DONE
+        self.done.release()
+        if reply:
+            self.conn.send_bytes(reply)
 
 
 class _PickledFactory:
@@ -689,7 +734,7 @@ def _layers(env: gym.Env[Any, Any]) -> Iterator[gym.Env[Any, Any]]:
         yield env
 
 
-def _work(conn: Connection, stale: Sequence[Connection], envs: TaskEnvs) -> None:
+def _work(line: _Line, stale: Sequence[Connection], envs: TaskEnvs) -> None:
     """Serve one chunk of envs until told to stop or until the parent is gone."""
     # Ctrl-C reaches the whole process group; the parent decides what happens then.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -700,17 +745,27 @@ def _work(conn: Connection, stale: Sequence[Connection], envs: TaskEnvs) -> None
         torch.set_num_threads(1)
     # A pipe at its end or broken means that the parent is gone: nobody is left to tell.
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while (message := conn.recv_bytes()) != _CLOSE:
-            conn.send_bytes(_answer(envs, message))
+        while (question := _next_question(line)) != _CLOSE:
+            message = line.conn.recv_bytes() if question == _COMMAND else None
+            line.answer(_answer(envs, message))
     envs.close()
 
 
-def _answer(envs: TaskEnvs, message: bytes) -> bytes:
+def _next_question(line: _Line) -> int:
+    parent = multiprocessing.parent_process()
+    while not line.go.acquire(timeout=_LOOK_AROUND * 10):
+        if parent is not None and not parent.is_alive():
+            return _CLOSE
+    return int(line.words[_QUESTION])
+
+
+def _answer(envs: TaskEnvs, message: bytes | None) -> bytes:
+    """Return what is to be told beyond the arrays, nothing after most steps; a step has no message."""
     try:
-        if message == _STEP:
+        if message is None:
             ended = envs.step_wait()
-            return _RESULT + _dumps(ended) if ended else _DONE
-        method, args = pickle.loads(message[1:])
+            return _RESULT + _dumps(ended) if ended else b""
+        method, args = pickle.loads(message)
         return _RESULT + _dumps(getattr(envs, method)(*args))
     except Exception as error:
         return _ERROR + _dumps((envs.blame(), traceback.format_exc(), _portable(error)))
@@ -734,15 +789,12 @@ def _read_error(reply: bytes) -> tuple[str, str, Exception | None]:
         return task, trace, None
 
 
-def _end_workers(
-    processes: list[BaseProcess], conns: list[Connection], owner: int, grace: float = 3.0
-) -> None:
+def _end_workers(processes: list[BaseProcess], lines: list[_Line], owner: int, grace: float = 3.0) -> None:
     if os.getpid() != owner:  # a forked copy of the parent must not end the parent's workers
         return
-    for conn in conns:
-        with contextlib.suppress(OSError):
-            conn.send_bytes(_CLOSE)
-        conn.close()
+    for line in lines:
+        line.ask(_CLOSE)
+        line.conn.close()
     _join(processes, grace)
     for process in processes:
         process.terminate()
@@ -751,7 +803,7 @@ def _end_workers(
         process.kill()
     _join(processes, 1.0)
     processes.clear()
-    conns.clear()
+    lines.clear()
 
 
 def _join(processes: Sequence[BaseProcess], seconds: float) -> None:

@@ -33,6 +33,7 @@ from sb3_ars.evaluation import (
 )
 from sb3_ars.experiments.config import Activation, RunConfig, load_config, save_config
 from sb3_ars.experiments.plots import plot_training
+from sb3_ars.profiling import PartTimer
 from sb3_ars.versions import run_versions
 
 __all__ = ["RunResult", "build_model", "evaluate_run", "final_table", "make_env", "train"]
@@ -49,12 +50,14 @@ class RunResult:
     :param table: one row per task: success, success_sampled, return, c_i; the final evaluation
     :param protocol: the final evaluation's protocol in one line
     :param seconds: training time
+    :param seconds_by_part: the same by part, where the run was profiled
     """
 
     folder: Path
     table: pd.DataFrame
     protocol: str
     seconds: float
+    seconds_by_part: dict[str, float] | None = None
 
 
 def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
@@ -85,15 +88,18 @@ def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
         )
         stack.callback(model.logger.close)
         started = time.monotonic()
+        timer = PartTimer(model.device) if config.profile else None
+        model.timer = timer or model.timer
         interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar)
         seconds = time.monotonic() - started
+        by_part = timer.seconds() if timer else None
         model.save(folder / "policy")
         evaluations = _evaluate_both(model, evaluation_env, protocol, progress_bar)
         table = final_table(evaluations, model.reward_scale.scale.tolist())
-        _write_result(folder, table, protocol, model, seconds, interrupted)
+        _write_result(folder, table, protocol, model, seconds, by_part, interrupted)
         names = list(evaluations[True].task_names)
         plot_training(folder / "progress.csv", names, model.reward_scale_history, folder / "training.png")
-    return RunResult(folder, table, protocol.describe(), seconds)
+    return RunResult(folder, table, protocol.describe(), seconds, by_part)
 
 
 def evaluate_run(
@@ -166,7 +172,6 @@ def build_model(config: RunConfig, env: VecEnv, verbose: int = 0) -> MultiTaskOf
             "critic_layer_norm": policy.critic_layer_norm,
             "std": policy.std,
             "weight_init": policy.weight_init,
-            "optimizer_kwargs": {"fused": policy.fused_optimizer},
         },
         seed=config.seed,
         verbose=verbose,
@@ -272,6 +277,7 @@ def _write_result(
     protocol: EvaluationProtocol,
     model: MultiTaskOffPolicyAlgorithm,
     seconds: float,
+    seconds_by_part: dict[str, float] | None,
     interrupted: bool,
 ) -> None:
     table.to_csv(folder / "evaluation.csv")
@@ -287,6 +293,7 @@ def _write_result(
             "resets": model.n_resets,
             "reward_scale_history": model.reward_scale_history,
             "training_seconds": round(seconds, 1),
+            "seconds_by_part": seconds_by_part,
             "interrupted": interrupted,
         },
     )

@@ -1,0 +1,67 @@
+"""Runs the CPU benchmarks one after another, writes their JSON, the chart and the documents' tables, prints the goals.
+
+python -m benchmarks.run_all            # what ``make bench`` runs; under 15 minutes on two cores
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks import env_steps, memory, report, training_loop, update
+from benchmarks.harness import RESULTS, write_result
+
+BENCHMARKS: dict[str, Callable[[], dict[str, Any]]] = {
+    "env_steps": env_steps.measure,
+    "update": update.measure,
+    "training_loop": training_loop.measure,
+    "memory": memory.measure,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", choices=BENCHMARKS, default=list(BENCHMARKS), help="these alone")
+    parser.add_argument(
+        "--output", type=Path, default=RESULTS, help="another folder leaves the documents as they are"
+    )
+    arguments = parser.parse_args()
+    failed = [name for name in arguments.only if not _ran(name, arguments.output)]
+    results = {name: r for name, r in report.read_results(arguments.output).items() if name in BENCHMARKS}
+    for name, result in results.items():
+        print("", report.tables(name, result), sep="\n")
+    print("", report.render("goals", results), sep="\n")
+    if arguments.output == RESULTS:
+        print("", "written:", *report.write_pages(), sep="\n")
+    else:
+        report.draw(
+            [p for group in report.panels_of(results).values() for p in group],
+            arguments.output / report.CHART,
+        )
+    if failed:
+        print("failed:", *failed, file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _ran(name: str, output: Path) -> bool:
+    """Run one benchmark; one that fails must not lose what the others measured."""
+    started = time.monotonic()
+    print(f"{name} ...", flush=True)
+    try:
+        path = write_result(name, BENCHMARKS[name](), output)
+    except Exception:
+        traceback.print_exc()
+        return False
+    print(f"  {path}, {time.monotonic() - started:.0f} s", flush=True)
+    return True
+
+
+if __name__ == "__main__":
+    sys.exit(main())
