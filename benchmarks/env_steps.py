@@ -40,7 +40,7 @@ from benchmarks.harness import (
 HORIZON = 500
 WARM_UP = 3  # joint steps before each timing
 GROUPS = 5  # environments that reset together
-UNITS = {"MT10": 200, "MT50": 100}  # joint steps timed in each round: multiples of HORIZON / GROUPS
+UNITS = {"MT10": 500, "MT50": 200}  # joint steps timed in each round: multiples of HORIZON / GROUPS
 N_GOALS = 50
 PEERS = {
     "sb3-subproc": "SB3 SubprocVecEnv",

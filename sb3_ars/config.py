@@ -10,10 +10,19 @@ from sb3_ars.core.objectives import ActorValue
 from sb3_ars.core.reward_scale import parse_reward_scaling
 from sb3_ars.errors import ConfigError, check_count, nearest
 
-__all__ = ["ARSConfig", "Execution", "ExecutionConfig", "Precision", "ResetScope", "RewardScaling"]
+__all__ = [
+    "ARSConfig",
+    "Execution",
+    "ExecutionConfig",
+    "Gradient",
+    "Precision",
+    "ResetScope",
+    "RewardScaling",
+]
 
 ResetScope = Literal["actor_critic", "critic", "none"]
 RewardScaling = Literal["mean", "std", "normalization", "none"] | float | tuple[float, ...] | dict[str, float]
+Gradient = Literal["mean", "pcgrad"]
 Precision = Literal["auto", "fp32", "tf32", "bf16"]
 Execution = Literal["auto", "eager", "fused", "compile", "cudagraph"]
 
@@ -39,6 +48,8 @@ class ARSConfig:
     """Gradient steps on the kept buffers right after a reset."""
     actor_value: ActorValue = "all"
     """Critics the actor's loss reads: "all" (SB3's reduction) or "first" (the authors' code)."""
+    gradient: Gradient = "mean"
+    """How the tasks' losses become one gradient: their "mean", or "pcgrad" (conflicting gradients projected)."""
 
     def __post_init__(self) -> None:
         if self.n_reset is not None:
@@ -52,6 +63,7 @@ class ARSConfig:
         _check_positive("reward_floor", self.reward_floor)
         _check_choice("reset", self.reset, (*get_args(ResetScope), None))
         _check_choice("actor_value", self.actor_value, get_args(ActorValue))
+        _check_choice("gradient", self.gradient, get_args(Gradient))
         if self.param_resets is not None:
             _check_param_resets(self.param_resets)
         if isinstance(self.reward_scaling, str):  # numbers are checked once the tasks are known

@@ -10,12 +10,20 @@ from sb3_contrib.tqc.policies import Actor as TQCActor
 from sb3_contrib.tqc.policies import Critic as QuantileCritic
 from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    NatureCNN,
+    get_actor_critic_arch,
+)
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import Actor, SACPolicy
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
 from sb3_ars.errors import ConfigError
+from sb3_ars.nets.bodies import body_config, build_body
+from sb3_ars.nets.layers import ByTask
 from sb3_ars.nets.mlp import MLP, with_layer_norm, xavier_
 
 __all__ = [
@@ -33,44 +41,76 @@ WeightInit = Literal["torch", "xavier"]
 _SOFTPLUS_STD_MIN = 1e-5  # the authors' code adds it to the softplus
 
 
-class _SoftplusStd:
-    """Mixin for SB3's actors: the second head gives softplus(rho) + 1e-5 as standard deviation."""
+class _TaskActor:
+    """Mixin for SB3's actors: a choice of how the standard deviation is parametrised, and of a body that sees tasks."""
 
     std: StdParametrization = "exp"
 
-    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        if self.std == "exp":
-            return super().get_action_dist_params(obs)  # type: ignore[misc,no-any-return]  # SB3's Actor comes next
+    def action_distribution(self, obs: PyTorchObs, task_major: bool = False) -> tuple[th.Tensor, th.Tensor]:
+        """Return mean and log standard deviation before squashing, each ``(rows, action_dim)``.
+
+        :param obs: ``(rows, obs_dim)``
+        :param task_major: whether the rows are task-major with equal counts, as in training batches
+        """
         assert isinstance(self, (Actor, TQCActor)) and callable(self.log_std)
-        latent = self.latent_pi(self.extract_features(obs, self.features_extractor))
-        std = nn.functional.softplus(self.log_std(latent)) + _SOFTPLUS_STD_MIN
-        return self.mu(latent), std.log(), {}
+        features = self.extract_features(obs, self.features_extractor)
+        if isinstance(self.latent_pi, ByTask):
+            mean, rho = self.latent_pi(features, task_major).chunk(2, dim=1)
+        else:
+            latent = self.latent_pi(features)
+            mean, rho = self.mu(latent), self.log_std(latent)
+        if self.std == "exp":
+            return mean, th.clamp(rho, LOG_STD_MIN, LOG_STD_MAX)
+        return mean, (nn.functional.softplus(rho) + _SOFTPLUS_STD_MIN).log()
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
+        return *self.action_distribution(obs), {}
 
 
-class ARSSACActor(_SoftplusStd, Actor):
-    """SB3's SAC actor with a choice of how the standard deviation is parametrised."""
+class ARSSACActor(_TaskActor, Actor):
+    """SB3's SAC actor with our options."""
 
 
-class ARSTQCActor(_SoftplusStd, TQCActor):
-    """sb3-contrib's TQC actor with a choice of how the standard deviation is parametrised."""
+class ARSTQCActor(_TaskActor, TQCActor):
+    """sb3-contrib's TQC actor with our options."""
 
 
-class ARSSACCritic(ContinuousCritic):
+class _TaskCritic:
+    """Mixin for SB3's critics: all values as one tensor."""
+
+    def q_values(self, obs: PyTorchObs, actions: th.Tensor, task_major: bool = False) -> th.Tensor:
+        """Return ``(rows, n_critics, n_outputs)``.
+
+        :param obs: ``(rows, obs_dim)``
+        :param actions: ``(rows, action_dim)``
+        :param task_major: whether the rows are task-major with equal counts, as in training batches
+        """
+        assert isinstance(self, (ContinuousCritic, QuantileCritic))
+        with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
+            features = self.extract_features(obs, self.features_extractor)
+        x = th.cat([features, actions], dim=1)
+        values = [net(x, task_major) if isinstance(net, ByTask) else net(x) for net in self.q_networks]
+        return self._stacked(values)
+
+    def _stacked(self, values: list[th.Tensor]) -> th.Tensor:
+        raise AssertionError(
+            "a subclass stacks as its parent does, for the order of sums is seen in the last bit"
+        )
+
+
+class ARSSACCritic(_TaskCritic, ContinuousCritic):
     """SB3's critics, whose values can also be had as one tensor."""
 
-    def q_values(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        """Return ``(rows, n_critics, 1)``."""
-        # stacked critic by critic, so that each critic's gradient is contiguous and sums in SB3's order, to the bit
-        return th.stack(self(obs, actions), dim=0).transpose(0, 1)
+    def _stacked(self, values: list[th.Tensor]) -> th.Tensor:
+        # critic by critic, so that each critic's gradient is contiguous and sums in SB3's order
+        return th.stack(values, dim=0).transpose(0, 1)
 
 
-class ARSTQCCritic(QuantileCritic):
+class ARSTQCCritic(_TaskCritic, QuantileCritic):
     """sb3-contrib's quantile critics under the name the update knows."""
 
-    def q_values(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        """Return ``(rows, n_critics, n_quantiles)``."""
-        quantiles: th.Tensor = self(obs, actions)
-        return quantiles
+    def _stacked(self, values: list[th.Tensor]) -> th.Tensor:
+        return th.stack(values, dim=1)
 
 
 class _PolicyOptions:
@@ -79,12 +119,16 @@ class _PolicyOptions:
     :param observation_space: observation space
     :param action_space: action space
     :param lr_schedule: learning rate schedule
-    :param net_arch: hidden layers, SB3's meaning; ``None`` is the paper's ``[400, 400, 400, 400]``
+    :param net_arch: hidden layers, SB3's meaning; ``None`` is the paper's ``[400, 400, 400, 400]``, or the body's own
     :param activation_fn: of actor and critics, SB3's meaning; ``None`` is the paper's ReLU actor and Tanh critics
     :param critic_activation_fn: of the critics alone
     :param critic_layer_norm: LayerNorm on the input and hidden layers of the critics (ARS-LN)
     :param std: ``"exp"`` of a clipped log standard deviation (SB3) or ``"softplus"`` (the authors' code)
     :param weight_init: ``"torch"`` or ``"xavier"`` (the authors' code)
+    :param body: a multi-task network in the place of the plain one, such as ``{"name": "moore", "n_experts": 4}``; see
+        :mod:`sb3_ars.nets.bodies`
+    :param critic_body: the same for the critics; ``"same"`` is ``body``, ``None`` the plain network
+    :param n_tasks: how many of an observation's last entries are the one-hot; the algorithm sets it
     :param kwargs: SB3's remaining policy options
 
     Source: paper, Table 8 and section 4.3.
@@ -104,6 +148,9 @@ class _PolicyOptions:
         critic_layer_norm: bool = False,
         std: StdParametrization = "exp",
         weight_init: WeightInit = "torch",
+        body: dict[str, Any] | None = None,
+        critic_body: dict[str, Any] | Literal["same"] | None = "same",
+        n_tasks: int = 1,
         **kwargs: Any,
     ) -> None:
         for option, value, allowed in (
@@ -119,22 +166,30 @@ class _PolicyOptions:
         self.critic_layer_norm = critic_layer_norm
         self.std: StdParametrization = std
         self.weight_init: WeightInit = weight_init
+        self.body, self.n_tasks = body, n_tasks
+        self.critic_body: Any = body if critic_body == "same" else critic_body
+        if net_arch is None:
+            net_arch = [400, 400, 400, 400] if body is None else list(body_config(body).net_arch)
         self._given_activations = (activation_fn, critic_activation_fn)
         self._critic_activation_fn = critic_activation_fn or activation_fn or nn.Tanh
         super().__init__(
             observation_space,  # type: ignore[call-arg]  # SB3's policy comes next in the order of classes
             action_space,
             lr_schedule,
-            net_arch=[400, 400, 400, 400] if net_arch is None else net_arch,
+            net_arch=net_arch,
             activation_fn=activation_fn or nn.ReLU,
             **kwargs,
         )
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)  # type: ignore[attr-defined]
-        actor = self.actor_class(**kwargs)
-        actor.std = self.std  # type: ignore[assignment]  # nn.Module's attributes are typed as tensors and modules
-        actor.latent_pi = MLP(*actor.latent_pi)
+        actor: Any = self.actor_class(**kwargs)
+        actor.std = self.std
+        if self.body is None:
+            actor.latent_pi = MLP(*actor.latent_pi)
+        else:
+            actor.latent_pi = self._by_task(self.body, actor, 2 * self._action_dim())
+            actor.mu, actor.log_std = nn.Identity(), nn.Identity()
         if self.weight_init == "xavier":
             xavier_(actor)
         return actor.to(self.device)  # type: ignore[attr-defined]
@@ -142,14 +197,37 @@ class _PolicyOptions:
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)  # type: ignore[attr-defined]
         critic: Any = self.critic_class(**{**kwargs, "activation_fn": self._critic_activation_fn})
-        critic.q_networks = [
-            with_layer_norm(net) if self.critic_layer_norm else MLP(*net) for net in critic.q_networks
-        ]
+        critic.q_networks = [self._critic_network(critic, net) for net in critic.q_networks]
         for index, net in enumerate(critic.q_networks):
             setattr(critic, f"qf{index}", net)
         if self.weight_init == "xavier":
             xavier_(critic)
         return critic.to(self.device)  # type: ignore[attr-defined]
+
+    def _critic_network(self, critic: Any, net: nn.Sequential) -> nn.Module:
+        if self.critic_body is not None:
+            return self._by_task(self.critic_body, critic, net[-1].out_features)  # type: ignore[arg-type]
+        return with_layer_norm(net) if self.critic_layer_norm else MLP(*net)
+
+    def _action_dim(self) -> int:
+        return get_action_dim(self.action_space)  # type: ignore[attr-defined]
+
+    def _by_task(self, body: dict[str, Any], owner: Any, out_features: int) -> ByTask:
+        """Return a body in the place of a plain network of SB3's actor or critics."""
+        is_actor = isinstance(owner, self.actor_class)
+        obs_dim = owner.features_extractor.features_dim - self.n_tasks
+        n_actions = 0 if is_actor else self._action_dim()
+        actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)  # type: ignore[attr-defined]
+        network = build_body(
+            body,
+            obs_dim + n_actions,
+            out_features,
+            self.n_tasks,
+            actor_arch if is_actor else critic_arch,
+            self.activation_fn if is_actor else self._critic_activation_fn,  # type: ignore[attr-defined]
+            layer_norm=self.critic_layer_norm and not is_actor,
+        )
+        return ByTask(network, obs_dim, self.n_tasks)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data: dict[str, Any] = super()._get_constructor_parameters()  # type: ignore[misc]
@@ -160,6 +238,9 @@ class _PolicyOptions:
             critic_layer_norm=self.critic_layer_norm,
             std=self.std,
             weight_init=self.weight_init,
+            body=self.body,
+            critic_body=self.critic_body,
+            n_tasks=self.n_tasks,
         )
         return data
 

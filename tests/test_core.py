@@ -214,16 +214,10 @@ def test_rows_get_their_own_tasks_temperature():
 # ---------------------------------------------------------------- the policy's density
 
 
-class FixedActor:
-    def __init__(self, mean, log_std):
-        self.params = th.tensor([mean]), th.tensor([log_std]), {}
-
-    def get_action_dist_params(self, obs):
-        return self.params
-
-
 def test_log_density_of_the_squashed_gaussian_by_hand():
-    actions, log_prob = squashed_gaussian(FixedActor([0.2], [math.log(0.5)]), None, th.tensor([[1.0]]))
+    actions, log_prob = squashed_gaussian(
+        th.tensor([[0.2]]), th.tensor([[math.log(0.5)]]), th.tensor([[1.0]])
+    )
     u = 0.2 + 0.5  # mean + std * noise
     density = -0.5 - math.log(0.5) - 0.5 * math.log(2 * math.pi)  # noise of 1 is one std away
     assert actions.item() == pytest.approx(math.tanh(u))
@@ -232,8 +226,7 @@ def test_log_density_of_the_squashed_gaussian_by_hand():
 
 def test_density_of_the_squashed_gaussian_integrates_to_one():
     noise = th.linspace(-8, 8, 200_001).reshape(-1, 1)
-    actor = FixedActor([0.3], [-0.5])
-    actions, log_prob = squashed_gaussian(actor, None, noise)
+    actions, log_prob = squashed_gaussian(th.tensor([[0.3]]), th.tensor([[-0.5]]), noise)
     assert np.trapezoid(log_prob.exp().flatten(), actions.flatten()) == pytest.approx(1.0, abs=1e-3)
 
 

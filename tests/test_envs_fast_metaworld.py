@@ -88,6 +88,24 @@ def test_every_task_equals_the_stock_env_while_grasping_and_where_a_reset_is_res
     stock.close()
 
 
+@pytest.mark.parametrize("task", list(ALL))
+def test_every_task_equals_the_stock_env_over_an_episode_of_random_actions_to_a_stored_goal(task):
+    fast, stock = (
+        MetaworldTask(task, goals="ordered", n_goals=2, first_goal=1, fast=fast) for fast in (True, False)
+    )
+    np.testing.assert_array_equal(fast.reset(seed=0)[0], stock.reset(seed=0)[0])
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        action = rng.uniform(-1, 1, 4).astype(np.float32)
+        (obs, reward, *_, truncated, info), (same, expected, *_, end, told) = (
+            fast.step(action),
+            stock.step(action),
+        )
+        np.testing.assert_allclose(obs, same, rtol=0, atol=1e-9)
+        assert reward == pytest.approx(expected, rel=0, abs=1e-9) and info["success"] == told["success"]
+    assert truncated and end
+
+
 @pytest.mark.filterwarnings("ignore:Constant")
 @pytest.mark.parametrize(
     "task", ["assembly-v3", "pick-place-v3", "hammer-v3", "lever-pull-v3", "stick-pull-v3"]

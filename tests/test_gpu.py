@@ -6,6 +6,7 @@ import pytest
 import torch as th
 
 from sb3_ars import ARSSAC, ARSTQC, make_toy_env
+from sb3_ars.core.update import Noise
 
 pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:.*leaves no updates")]
 SMALL = {
@@ -48,7 +49,7 @@ def test_an_update_on_cuda_is_the_update_on_the_cpu_up_to_rounding():
     noise = th.randn(64, 2), th.randn(64, 2)
     for model in (cpu, cuda):
         model.replay_buffer.draw_slots = lambda n, d=model.device: slots.to(d)
-        model._draw_noise = lambda actions, d=model.device: tuple(n.to(d) for n in noise)
+        model._draw_noise = lambda actions, d=model.device: Noise(*(n.to(d) for n in noise))
         model.train(gradient_steps=3, batch_size=16)
     for a, b in zip(cpu.policy.parameters(), cuda.policy.parameters(), strict=True):
         assert th.allclose(a, b.cpu(), atol=1e-4)

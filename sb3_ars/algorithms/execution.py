@@ -131,7 +131,8 @@ class CapturedActor:
     def _forward(self, deterministic: bool) -> None:
         self._obs.copy_(self._host_obs, non_blocking=True)
         self._noise.zero_() if deterministic else self._noise.normal_()
-        actions, _ = squashed_gaussian(self._actor, self._obs, self._noise)
+        mean, log_std = self._actor.action_distribution(self._obs)
+        actions, _ = squashed_gaussian(mean, log_std, self._noise)
         self._host_actions.copy_(actions, non_blocking=True)
 
 

@@ -39,12 +39,21 @@ from sb3_ars.algorithms.execution import CapturedActor, ExecutionPlan, WorkWhile
 from sb3_ars.algorithms.task_log import TaskLog
 from sb3_ars.buffers import TaskReplayBuffer
 from sb3_ars.callbacks.ars import ARSCallback
-from sb3_ars.config import ARSConfig, Execution, ExecutionConfig, Precision, ResetScope, RewardScaling
+from sb3_ars.config import (
+    ARSConfig,
+    Execution,
+    ExecutionConfig,
+    Gradient,
+    Precision,
+    ResetScope,
+    RewardScaling,
+)
+from sb3_ars.core.gradients import MeanGradient, PCGrad
 from sb3_ars.core.objectives import ActorValue, Objective
 from sb3_ars.core.reset import reset_module_, reset_optimizer_
 from sb3_ars.core.reward_scale import RewardScale, RewardStatistics, parse_reward_scaling
 from sb3_ars.core.runner import CapturedCalls, compiled, prepare_optimizer_, tf32
-from sb3_ars.core.update import Hyperparameters, Metrics, Timer, UpdateState, update
+from sb3_ars.core.update import Hyperparameters, Metrics, Noise, Timer, UpdateState, update
 from sb3_ars.envs import make_multitask_env
 from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, check_count
 from sb3_ars.nets.mlp import set_arithmetic
@@ -82,6 +91,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param reset: ``"actor_critic"``, ``"critic"`` or ``"none"``
     :param updates_after_reset: gradient steps right after a reset
     :param actor_value: critics the actor's loss reads: ``"all"`` (SB3's reduction) or ``"first"``
+    :param gradient: ``"mean"`` of the tasks' losses, or ``"pcgrad"``
 
     and of :class:`sb3_ars.config.ExecutionConfig`, which change speed and rounding:
 
@@ -111,6 +121,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     reset: ResetScope | None
     updates_after_reset: int
     actor_value: ActorValue
+    gradient: Gradient
 
     # ExecutionConfig's, likewise
     precision: Precision
@@ -161,9 +172,17 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         precision: Precision = "auto",
         execution: Execution = "auto",
         overlap: bool | None = None,
+        gradient: Gradient = "mean",
     ) -> None:
         config = ARSConfig(
-            n_reset, param_resets, reward_scaling, reward_floor, reset, updates_after_reset, actor_value
+            n_reset,
+            param_resets,
+            reward_scaling,
+            reward_floor,
+            reset,
+            updates_after_reset,
+            actor_value,
+            gradient,
         )
         execution_config = ExecutionConfig(precision, execution, overlap)
         is_auto = _is_auto(learning_starts)
@@ -226,6 +245,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             self.learning_starts = self._auto_learning_starts = 0
         self._check_options()
         self._read_tasks(self.env)
+        if self._bodies():
+            self.policy_kwargs["n_tasks"] = self.n_tasks
         if self.is_multi_task and self._uses_task_buffer():
             self.replay_buffer_class = self.replay_buffer_class or TaskReplayBuffer
             if self.replay_buffer is None:
@@ -237,6 +258,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._task_log = TaskLog(self.task_names or [], self._stats_window_size)
         self._warned_of_waiting = False
         self._updates_are_done = False
+        self._combiner = MeanGradient() if self.gradient == "mean" else PCGrad()
         self._prepare_execution()
 
     @property
@@ -295,6 +317,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _check_tasks(self, env: VecEnv, names: list[str] | None) -> None:
         """Raise if options or wrappers do not go with these tasks; change nothing."""
         if names is None:
+            self._check_one_task()
             return
         if self.n_steps > 1:
             raise ConfigError(f"n_steps={self.n_steps} is not available with several tasks; use n_steps=1.")
@@ -310,10 +333,29 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
                 "needs raw rewards. Use VecNormalize(norm_reward=False) and choose reward_scaling instead."
             )
         parse_reward_scaling(self.reward_scaling, names)
+        if self.gradient != "mean" and len(names) < 2:
+            raise ConfigError(
+                f"gradient={self.gradient!r} projects one task's gradient on another's; with one task use 'mean'."
+            )
         if self.batch_size > self.buffer_size:
             raise ConfigError(
                 f"batch_size={self.batch_size} rows per task is more than buffer_size={self.buffer_size} per task "
                 "can ever hold; raise buffer_size or lower batch_size."
+            )
+
+    def _bodies(self) -> list[str]:
+        """Return the policy options that ask for a network which sees the task."""
+        options = ("body", "critic_body")
+        return [name for name in options if self.policy_kwargs.get(name) not in (None, "same")]
+
+    def _check_one_task(self) -> None:
+        """Refuse, for a plain environment, what needs to know the tasks."""
+        wanted = [f"policy_kwargs[{name!r}]" for name in self._bodies()]
+        wanted += ["gradient"] if self.gradient != "mean" else []
+        if wanted:
+            raise ConfigError(
+                f"{wanted[0]} needs an environment with named tasks; make it with make_multitask_env or "
+                "make_metaworld_env."
             )
 
     def _uses_task_buffer(self) -> bool:
@@ -343,7 +385,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _make_update_state(self) -> UpdateState:
         actor, critic, critic_target = self.actor, self.critic, self.critic_target
         if self._plan.execution == "compile":
-            actor = compiled(actor, "get_action_dist_params")
+            actor = compiled(actor, "action_distribution")
             critic, critic_target = compiled(critic, "q_values"), compiled(critic_target, "q_values")
         return UpdateState(
             actor=actor,
@@ -613,7 +655,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
         hyperparameters = Hyperparameters(
-            self.gamma, self.tau, float(self.target_entropy), self._make_objective()
+            self.gamma, self.tau, float(self.target_entropy), self._make_objective(), self._combiner
         )
         with tf32(self._plan.tf32):
             for _ in range(gradient_steps):
@@ -656,9 +698,13 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
                 else:
                     group["lr"] = learning_rate
 
-    def _draw_noise(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return standard normal noise for the actions at s and at s', in the order SB3 draws it."""
-        return th.randn_like(actions), th.randn_like(actions)
+    def _draw_noise(self, actions: th.Tensor) -> Noise:
+        """Return what is random in one update, the actions' noise first and in the order SB3 draws it."""
+        noise = th.randn_like(actions), th.randn_like(actions)
+        if self.gradient == "mean":
+            return Noise(*noise)
+        shape = (self.n_tasks, self.n_tasks)
+        return Noise(*noise, *(th.rand(shape, device=self.device) for _ in range(2)))
 
     def has_batch(self) -> bool:
         """Return whether the buffer holds a batch of every task; a run resumed without its buffer does not at first."""
@@ -891,7 +937,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["_update_state", "_task_log", "reward_scale", "timer", "_plan"]
+        ours = ["_update_state", "_task_log", "reward_scale", "timer", "_plan", "_combiner"]
         captured = ["_captured_updates", "_captured_actor", "_stepping_env"]
         return [*super()._excluded_save_params(), *ours, *captured]
 

@@ -13,26 +13,39 @@ from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
+from sb3_ars.core.gradients import GradientCombiner, MeanGradient
 from sb3_ars.core.objectives import Objective
 from sb3_ars.core.reward_scale import RewardScale
 from sb3_ars.core.targets import soft_target
 from sb3_ars.core.temperature import per_row, temperature_loss
 
-__all__ = ["Batch", "Hyperparameters", "Metrics", "Timer", "UpdateState", "squashed_gaussian", "update"]
+__all__ = [
+    "Batch",
+    "Hyperparameters",
+    "Metrics",
+    "Noise",
+    "Timer",
+    "UpdateState",
+    "squashed_gaussian",
+    "update",
+]
 
 
 class Actor(Protocol):
-    """What the update needs of an actor; SB3's ``Actor`` has it."""
+    """What the update needs of an actor."""
 
-    def get_action_dist_params(self, obs: Any) -> tuple[th.Tensor, th.Tensor, dict[str, Any]]:
-        """Return mean and log standard deviation, each ``(rows, action_dim)``, and extras the update ignores."""
+    def action_distribution(self, obs: Any, task_major: bool = False) -> tuple[th.Tensor, th.Tensor]:
+        """Return mean and log standard deviation before squashing, each ``(rows, action_dim)``.
+
+        :param task_major: whether the rows are task-major with equal counts, which some networks are faster on
+        """
 
 
 class Critic(Protocol):
     """What the update needs of the critics."""
 
-    def q_values(self, obs: Any, actions: th.Tensor) -> th.Tensor:
-        """Return ``(rows, n_critics, n_outputs)``."""
+    def q_values(self, obs: Any, actions: th.Tensor, task_major: bool = False) -> th.Tensor:
+        """Return ``(rows, n_critics, n_outputs)``; ``task_major`` as in :class:`Actor`."""
 
     def parameters(self) -> Iterable[th.Tensor]:
         """Return what the critic optimizer steps, in the same order in critics and target critics."""
@@ -106,12 +119,29 @@ class Hyperparameters:
     :param tau: weight of the new critics in the target, in (0, 1]
     :param target_entropy: H, in nats
     :param objective: SAC's or TQC's
+    :param combiner: how the tasks' losses become one gradient, of the actor and of all critics together
     """
 
     discount: float
     tau: float
     target_entropy: float
     objective: Objective
+    combiner: GradientCombiner
+
+
+class Noise(NamedTuple):
+    """All that is random in one update but the batch.
+
+    :param action: ``(rows, action_dim)``, standard normal, for the actions at s
+    :param next_action: the same at s'
+    :param critic_order: ``(n_tasks, n_tasks)``, U(0, 1), or ``None`` for combiners that need none
+    :param actor_order: the same for the actor's gradient
+    """
+
+    action: th.Tensor
+    next_action: th.Tensor
+    critic_order: th.Tensor | None = None
+    actor_order: th.Tensor | None = None
 
 
 class Timer(Protocol):
@@ -136,7 +166,7 @@ class Metrics(NamedTuple):
 def update(
     state: UpdateState,
     batch: Batch,
-    noise: tuple[th.Tensor, th.Tensor],
+    noise: Noise,
     reward_scale: RewardScale,
     hyperparameters: Hyperparameters,
     update_target: bool = True,
@@ -148,7 +178,7 @@ def update(
 
     :param state: changed in place
     :param batch: raw rewards
-    :param noise: two standard normal tensors ``(rows, action_dim)``, for the actions at s and at s'
+    :param noise: drawn by the caller
     :param reward_scale: c_i
     :param hyperparameters: constants
     :param update_target: whether the target critics move in this step
@@ -157,17 +187,29 @@ def update(
     Source: paper, Eq. 3, 4 and 7; with one task, c = 1 and SB3's networks it is SB3's ``SAC.train``, or sb3-contrib's
     ``TQC.train``, to the bit.
     """
-    objective = hyperparameters.objective
-    n_rows = batch.rewards.shape[0]
+    objective, combiner = hyperparameters.objective, hyperparameters.combiner
+    obs, next_obs, n_rows = batch.observations, batch.next_observations, batch.rewards.shape[0]
+    n_tasks = reward_scale.scale.shape[0]
+    # what needs a gradient is computed group by group: all rows at once, or for PCGrad each task's on their own
+    groups = combiner.rows(n_rows, n_tasks)
+    task_major = len(groups) == 1
+
     with timer("actor"):
-        actions_pi, log_prob = squashed_gaussian(state.actor, batch.observations, noise[0])
+        sampled = [
+            squashed_gaussian(
+                *state.actor.action_distribution(_rows(obs, group, n_rows), task_major), noise.action[group]
+            )
+            for group in groups
+        ]
+        log_prob = th.cat([log_prob for _, log_prob in sampled])
         ent_coef, ent_coef_loss = _step_temperature(state, log_prob, hyperparameters.target_entropy)
         row_ent_coef = per_row(ent_coef, n_rows)
 
     with timer("critic"):
         with th.no_grad():
-            next_actions, next_log_prob = squashed_gaussian(state.actor, batch.next_observations, noise[1])
-            next_q = state.critic_target.q_values(batch.next_observations, next_actions)
+            distribution = state.actor.action_distribution(next_obs, task_major=True)
+            next_actions, next_log_prob = squashed_gaussian(*distribution, noise.next_action)
+            next_q = state.critic_target.q_values(next_obs, next_actions, task_major=True)
             discount = hyperparameters.discount if batch.discounts is None else batch.discounts
             target = soft_target(
                 batch.rewards,
@@ -178,40 +220,42 @@ def update(
                 next_log_prob,
                 reward_scale,
             )
-        q = state.critic.q_values(batch.observations, batch.actions)
-        critic_loss = objective.loss(q, target).mean()
-        _step(state.critic_optimizer, critic_loss)
+        q = [
+            state.critic.q_values(_rows(obs, group, n_rows), batch.actions[group], task_major)
+            for group in groups
+        ]
+        losses = [
+            objective.loss(values, target[group]).mean() for values, group in zip(q, groups, strict=True)
+        ]
+        critic_loss = _mean(losses)
+        _step(state.critic_optimizer, losses, combiner, noise.critic_order)
 
     with timer("actor"):
-        with _frozen(state.critic_parameters):
-            q_pi = state.critic.q_values(batch.observations, actions_pi)
-        actor_loss = (row_ent_coef * log_prob - objective.actor_value(q_pi)).mean()
-        _step(state.actor_optimizer, actor_loss)
+        losses = []
+        for group, (actions, own_log_prob) in zip(groups, sampled, strict=True):
+            with _frozen(state.critic_parameters):
+                q_pi = state.critic.q_values(_rows(obs, group, n_rows), actions, task_major)
+            losses.append((row_ent_coef[group] * own_log_prob - objective.actor_value(q_pi)).mean())
+        actor_loss = _mean(losses)
+        _step(state.actor_optimizer, losses, combiner, noise.actor_order)
 
     with timer("targets"):
         if update_target:
             _move_target(state, hyperparameters.tau)
-    n_tasks = reward_scale.scale.shape[0]
-    return Metrics(
-        actor_loss.detach(),
-        critic_loss.detach(),
-        ent_coef_loss,
-        ent_coef,
-        q.detach().reshape(n_tasks, -1).mean(dim=1),
-    )
+    q_value = th.cat([values.detach() for values in q]).reshape(n_tasks, -1).mean(dim=1)
+    return Metrics(actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value)
 
 
-def squashed_gaussian(actor: Actor, obs: Any, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def squashed_gaussian(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """Return actions tanh(mean + std * noise) in [-1, 1] and their log probabilities.
 
-    :param actor: gives mean and log std
-    :param obs: ``(rows, obs_dim)``
+    :param mean: ``(rows, action_dim)``
+    :param log_std: ``(rows, action_dim)``
     :param noise: ``(rows, action_dim)``, standard normal
     :return: ``(rows, action_dim)`` and ``(rows, 1)``
 
     Source: SAC (Haarnoja et al. 2018), appendix C, with SB3's epsilon of 1e-6.
     """
-    mean, log_std, _ = actor.get_action_dist_params(obs)
     std = log_std.exp()
     gaussian = mean + noise * std
     actions = th.tanh(gaussian)
@@ -233,17 +277,35 @@ def _step_temperature(
         return state.ent_coef.reshape(1), th.zeros((), device=log_prob.device)
     ent_coef = th.exp(state.log_ent_coef.detach())
     loss = temperature_loss(state.log_ent_coef, log_prob, target_entropy)
-    _step(state.ent_coef_optimizer, loss)
+    _step(state.ent_coef_optimizer, [loss], _MEAN)
     return ent_coef, loss.detach()
 
 
-def _step(optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
+def _step(
+    optimizer: th.optim.Optimizer,
+    losses: Sequence[th.Tensor],
+    combiner: GradientCombiner,
+    order: th.Tensor | None = None,
+) -> None:
     """Step the optimizer's own parameters; gradients of other parameters in the graph are not computed."""
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    gradients = th.autograd.grad(loss, parameters, allow_unused=True)
+    gradients = combiner.combine(losses, parameters, order)
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient
     optimizer.step()
+
+
+_MEAN = MeanGradient()  # a temperature sees one task alone: nothing to combine
+
+
+def _mean(losses: Sequence[th.Tensor]) -> th.Tensor:
+    detached = [loss.detach() for loss in losses]
+    return detached[0] if len(detached) == 1 else th.stack(detached).mean()
+
+
+def _rows(obs: Any, group: slice, n_rows: int) -> Any:
+    """Return some rows of the observations; all of them also where they are SB3's dictionary."""
+    return obs if group == slice(0, n_rows) else obs[group]
 
 
 @contextlib.contextmanager

@@ -26,6 +26,7 @@ __all__ = [
 ]
 
 Activation = Literal["relu", "tanh"]
+Body = Literal["plain", "multi_head", "soft_modules", "moore", "paco"]
 Config = TypeVar("Config")
 
 
@@ -97,6 +98,12 @@ class PolicyConfig:
     """How the policy's standard deviation is parametrised."""
     weight_init: Literal["torch", "xavier"] = "torch"
     """Initial weights."""
+    body: Body = "plain"
+    """Network of the actor: plain, or one that treats tasks differently."""
+    critic_body: Literal["same", Body] = "same"
+    """Network of the critics; same is the actor's."""
+    body_options: dict[str, int] = field(default_factory=dict)
+    """Options of the body, such as n_experts; those not given have the paper's value for MT10."""
 
 
 @dataclass(frozen=True)

@@ -172,12 +172,20 @@ def build_model(config: RunConfig, env: VecEnv, verbose: int = 0) -> MultiTaskOf
             "critic_layer_norm": policy.critic_layer_norm,
             "std": policy.std,
             "weight_init": policy.weight_init,
+            "body": _body(policy.body, policy.body_options),
+            "critic_body": "same"
+            if policy.critic_body == "same"
+            else _body(policy.critic_body, policy.body_options),
         },
         seed=config.seed,
         verbose=verbose,
         **options,
         **{f.name: getattr(config.ars, f.name) for f in dataclasses.fields(config.ars)},
     )
+
+
+def _body(name: str, options: dict[str, int]) -> dict[str, Any] | None:
+    return None if name == "plain" else {"name": name, **options}
 
 
 def protocol_of(config: RunConfig, own_horizon: bool = True) -> EvaluationProtocol:

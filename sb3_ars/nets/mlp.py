@@ -68,15 +68,16 @@ class MLP(nn.Sequential):
 
 
 def set_arithmetic(module: nn.Module, fused: bool, precision: Precision) -> None:
-    """Choose how every :class:`MLP` inside ``module`` is computed.
+    """Choose how every :class:`MLP` inside ``module``, and every other layer with these attributes, is computed.
 
     :param module: actor, critics or a whole policy
     :param fused: see :class:`MLP`
     :param precision: see :class:`MLP`
     """
     for layer in module.modules():
-        if isinstance(layer, MLP):
-            layer.fused, layer.precision = fused, precision
+        for attribute, value in (("fused", fused), ("precision", precision)):
+            if hasattr(layer, attribute):
+                setattr(layer, attribute, value)
 
 
 def fused_layers_are_available() -> bool:
@@ -174,4 +175,7 @@ def xavier_(module: nn.Module) -> None:
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.xavier_normal_(layer.weight)
-            nn.init.zeros_(layer.bias)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+        elif callable(own := getattr(layer, "xavier_", None)):
+            own()

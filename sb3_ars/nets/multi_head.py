@@ -1,0 +1,48 @@
+"""A shared trunk with one output layer per task; knows no losses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch as th
+from torch import nn
+
+from sb3_ars.nets.layers import Body, TaskLinear, trunk
+
+__all__ = ["MultiHead"]
+
+
+class MultiHead(Body):
+    """y = W_i h + b_i, where h is the trunk's output and i the row's task.
+
+    :param in_features: width of the input, without the one-hot
+    :param out_features: width of the output
+    :param n_tasks: number of tasks
+    :param hidden: widths of the trunk's layers
+    :param activation: class of the activation
+    :param layer_norm: LayerNorm on the input and before every activation
+    :param task_in_input: whether the trunk sees the one-hot too
+
+    Source: the multi-task, multi-head SAC of Yu et al. 2019 (Meta-World). The one-hot stays in the input, as in the
+    authors' code of ARS and in Soft Modularization's.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        n_tasks: int,
+        hidden: Sequence[int],
+        activation: type[nn.Module],
+        layer_norm: bool = False,
+        task_in_input: bool = True,
+    ) -> None:
+        super().__init__(task_in_input)
+        in_features += n_tasks * task_in_input
+        self.trunk = trunk(in_features, hidden, activation, layer_norm)
+        self.heads = TaskLinear([in_features, *hidden][-1], out_features, n_tasks)
+
+    def compute(self, x: th.Tensor, task: th.Tensor, task_major: bool) -> th.Tensor:
+        """Return ``(rows, out_features)``; see :meth:`Body.compute`."""
+        out: th.Tensor = self.heads(self.trunk(x), task, task_major)
+        return out
