@@ -349,7 +349,7 @@ def _cpu_flags() -> list[str]:
 
 def _tree_is_dirty() -> bool | None:
     """Return whether files differ from the commit, those that benchmarks write left out; ``None`` without git."""
-    paths = [".", ":!benchmarks/results", ":!docs/performance.md", ":!README.md"]
+    paths = [".", ":!benchmarks/results", ":!docs/performance.md"]
     try:
         done = subprocess.run(
             ["git", "status", "--porcelain", "--", *paths],

@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks import memory
 from benchmarks.harness import RESULTS, ROOT, markdown_table
 
-PAGES = (ROOT / "docs" / "performance.md", ROOT / "README.md")
+PAGES = (ROOT / "docs" / "performance.md",)
 CHART = "performance.png"
 UNMEASURED = "Not measured yet."
 _BLOCK = re.compile(r"(<!-- begin: (?P<name>[\w-]+) -->\n).*?(<!-- end: (?P=name) -->)", re.DOTALL)
