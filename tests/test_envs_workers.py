@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_ars.envs import MultiTaskVecEnv, make_toy_env
+from sb3_ars.envs import MultiTaskVecEnv, make_toy_env, workers
 from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
 
 # Else each worker would import this module, and SB3 and torch with it.
@@ -383,3 +383,17 @@ def test_a_script_without_a_main_guard_runs_once_and_may_define_its_env(tmp_path
     )
     assert done.stdout.split() == ["started", "finished"], done.stderr
     assert done.stderr == ""
+
+
+def test_a_worker_that_stops_between_its_wake_up_and_its_message_is_not_waited_for_without_end():
+    env = build(worker_timeout=0.5)
+    pool = env._runner
+    line = pool._lines[1]
+    line.words[workers._ANSWER] = workers._REPLY  # as if it had been stopped right after announcing a message
+    line.done.release()
+    pool._awaiting.add(1)
+    with pytest.raises(
+        WorkerError, match=r"Env worker 1 .* did not answer within 0.5 s while stepping its envs"
+    ):
+        pool.step_wait()
+    env.close()

@@ -268,8 +268,10 @@ def test_a_failing_environment_is_reported_although_an_update_ran():
         model.learn(5000)
 
 
-def test_train_called_by_the_user_trains_whatever_overlap_is():
-    model = make(overlap=True).learn(400)
+@pytest.mark.parametrize("steps", [200, 400])  # the first ends with the random phase
+@pytest.mark.filterwarnings("ignore:.*leaves no updates")
+def test_train_called_by_the_user_trains_whatever_overlap_is(steps):
+    model = make(overlap=True).learn(steps)
     n_updates = model._n_updates
     model.train(gradient_steps=2, batch_size=16)
     assert model._n_updates == n_updates + 2

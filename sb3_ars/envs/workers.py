@@ -555,6 +555,8 @@ class WorkerPool:
         line = self._lines[worker]
         if line.words[_ANSWER] == _REPLY:
             try:
+                if not line.conn.poll(self._timeout):  # stopped between its wake-up and its message
+                    self._fail_hung(self._timeout, doing)
                 self._replies[worker] = line.conn.recv_bytes()
             except (EOFError, OSError):
                 self._fail_dead(worker, f"while {doing}")

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from torch import nn
 
 from sb3_ars.errors import ConfigError, check_count, nearest
-from sb3_ars.nets.layers import Body
+from sb3_ars.nets.layers import Body, BodyShape
 from sb3_ars.nets.moore import MOORE
 from sb3_ars.nets.multi_head import MultiHead
 from sb3_ars.nets.paco import PaCo
@@ -183,7 +183,6 @@ def build_body(
     config = body_config(options)
     config.check(hidden)
     body_class: Any = config.body_class  # its constructor takes what its config has
-    body: Body = body_class(
-        in_features, out_features, n_tasks, hidden, activation, layer_norm, **asdict(config)
-    )
+    shape = BodyShape(in_features, out_features, n_tasks, hidden, activation, layer_norm)
+    body: Body = body_class(shape, **asdict(config))
     return body

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
@@ -12,7 +12,35 @@ from torch.autograd.function import once_differentiable
 
 from sb3_ars.nets.mlp import MLP, Precision, _product, _weight_gradient
 
-__all__ = ["Body", "ByTask", "StackedLayerNorm", "StackedLinear", "TaskLinear", "stacked_product", "trunk"]
+__all__ = [
+    "Body",
+    "BodyShape",
+    "ByTask",
+    "StackedLayerNorm",
+    "StackedLinear",
+    "TaskLinear",
+    "stacked_product",
+    "trunk",
+]
+
+
+class BodyShape(NamedTuple):
+    """What every body is built from, beside its own options.
+
+    :param in_features: width of the input, without the one-hot
+    :param out_features: width of the output
+    :param n_tasks: number of tasks
+    :param hidden: widths of the hidden layers; each body says what it makes of them
+    :param activation: class of the activation of hidden layers
+    :param layer_norm: LayerNorm on the input and before every activation on the way to the output
+    """
+
+    in_features: int
+    out_features: int
+    n_tasks: int
+    hidden: Sequence[int]
+    activation: type[nn.Module]
+    layer_norm: bool = False
 
 
 class Body(nn.Module, ABC):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch as th
 from torch import nn
 
-from sb3_ars.nets.layers import Body, StackedLayerNorm, StackedLinear, TaskLinear
+from sb3_ars.nets.layers import Body, BodyShape, StackedLayerNorm, StackedLinear, TaskLinear
 
 __all__ = ["MOORE", "orthonormal", "orthonormal_coefficients"]
 
@@ -20,12 +19,7 @@ _ABSOLUTE_FLOOR = 1e-6  # of any length, for experts that give zero
 class MOORE(Body):
     """y = W_i tanh(V w_i) + b_i, where V holds the experts' outputs after Gram-Schmidt.
 
-    :param in_features: width of the input, without the one-hot
-    :param out_features: width of the output
-    :param n_tasks: number of tasks
-    :param hidden: widths of an expert's layers; the last one has no activation
-    :param activation: class of the activation between an expert's layers
-    :param layer_norm: LayerNorm on the input and before every activation inside the experts
+    :param shape: ``hidden`` is one expert, whose last layer has no activation
     :param n_experts: K
     :param task_in_input: whether the experts see the one-hot
 
@@ -35,16 +29,12 @@ class MOORE(Body):
 
     def __init__(
         self,
-        in_features: int,
-        out_features: int,
-        n_tasks: int,
-        hidden: Sequence[int],
-        activation: type[nn.Module],
-        layer_norm: bool = False,
+        shape: BodyShape,
         n_experts: int = 4,
         task_in_input: bool = True,
     ) -> None:
         super().__init__(task_in_input)
+        in_features, out_features, n_tasks, hidden, activation, layer_norm = shape
         in_features += n_tasks * task_in_input
         layers: list[nn.Module] = [nn.LayerNorm(in_features)] if layer_norm else []
         widths = [in_features, *hidden]

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch as th
-from torch import nn
 
-from sb3_ars.nets.layers import Body, TaskLinear, trunk
+from sb3_ars.nets.layers import Body, BodyShape, TaskLinear, trunk
 
 __all__ = ["MultiHead"]
 
@@ -15,12 +12,7 @@ __all__ = ["MultiHead"]
 class MultiHead(Body):
     """y = W_i h + b_i, where h is the trunk's output and i the row's task.
 
-    :param in_features: width of the input, without the one-hot
-    :param out_features: width of the output
-    :param n_tasks: number of tasks
-    :param hidden: widths of the trunk's layers
-    :param activation: class of the activation
-    :param layer_norm: LayerNorm on the input and before every activation
+    :param shape: ``hidden`` is the trunk
     :param task_in_input: whether the trunk sees the one-hot too
 
     Source: the multi-task, multi-head SAC of Yu et al. 2019 (Meta-World). The one-hot stays in the input, as in the
@@ -29,15 +21,11 @@ class MultiHead(Body):
 
     def __init__(
         self,
-        in_features: int,
-        out_features: int,
-        n_tasks: int,
-        hidden: Sequence[int],
-        activation: type[nn.Module],
-        layer_norm: bool = False,
+        shape: BodyShape,
         task_in_input: bool = True,
     ) -> None:
         super().__init__(task_in_input)
+        in_features, out_features, n_tasks, hidden, activation, layer_norm = shape
         in_features += n_tasks * task_in_input
         self.trunk = trunk(in_features, hidden, activation, layer_norm)
         self.heads = TaskLinear([in_features, *hidden][-1], out_features, n_tasks)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch as th
 from torch import nn
 
-from sb3_ars.nets.layers import Body, StackedLinear, stacked_product
+from sb3_ars.nets.layers import Body, BodyShape, StackedLinear, stacked_product
 
 __all__ = ["PaCo", "mask_out"]
 
@@ -16,12 +15,7 @@ __all__ = ["PaCo", "mask_out"]
 class PaCo(Body):
     """theta_i = Phi w_i in every layer.
 
-    :param in_features: width of the input, without the one-hot
-    :param out_features: width of the output
-    :param n_tasks: number of tasks
-    :param hidden: widths of the hidden layers
-    :param activation: class of the activation
-    :param layer_norm: LayerNorm, one for all sets, on the input and before every activation
+    :param shape: ``hidden`` is the network; LayerNorm is one for all sets
     :param n_parameter_sets: K
     :param task_in_input: whether the input sees the one-hot; w_i carries the task in any case
 
@@ -31,16 +25,12 @@ class PaCo(Body):
 
     def __init__(
         self,
-        in_features: int,
-        out_features: int,
-        n_tasks: int,
-        hidden: Sequence[int],
-        activation: type[nn.Module],
-        layer_norm: bool = False,
+        shape: BodyShape,
         n_parameter_sets: int = 5,
         task_in_input: bool = False,
     ) -> None:
         super().__init__(task_in_input)
+        in_features, out_features, n_tasks, hidden, activation, layer_norm = shape
         widths = [in_features + n_tasks * task_in_input, *hidden, out_features]
         self.activation = activation()
         self.task_weights = nn.Parameter(th.randn(n_tasks, n_parameter_sets))  # w_i is row i

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch as th
 from torch import nn
 
-from sb3_ars.nets.layers import Body, StackedLayerNorm, StackedLinear, trunk
+from sb3_ars.nets.layers import Body, BodyShape, StackedLayerNorm, StackedLinear, trunk
 from sb3_ars.nets.mlp import MLP
 
 __all__ = ["SoftModules"]
@@ -16,12 +14,8 @@ __all__ = ["SoftModules"]
 class SoftModules(Body):
     """Modules m_(l,k) mixed by the probabilities P_l that a gate computes from observation and task.
 
-    :param in_features: width of the input, without the one-hot
-    :param out_features: width of the output
-    :param n_tasks: number of tasks
-    :param hidden: widths of the observation's embedding, whose last is D; the activation of the last is the body's
-    :param activation: class of the activation, wherever the publication has a ReLU
-    :param layer_norm: LayerNorm on the input and before every activation from there to the output; not in the gate
+    :param shape: ``hidden`` is the embedding of the observation, whose last width is D, its last activation the body's;
+        ``activation`` stands wherever the publication has a ReLU; ``layer_norm`` leaves out the gate
     :param n_layers: L, layers of modules
     :param n_modules: n, modules in a layer
     :param module_width: d
@@ -34,12 +28,7 @@ class SoftModules(Body):
 
     def __init__(
         self,
-        in_features: int,
-        out_features: int,
-        n_tasks: int,
-        hidden: Sequence[int],
-        activation: type[nn.Module],
-        layer_norm: bool = False,
+        shape: BodyShape,
         n_layers: int = 4,
         n_modules: int = 4,
         module_width: int = 128,
@@ -47,6 +36,7 @@ class SoftModules(Body):
         task_in_input: bool = False,
     ) -> None:
         super().__init__(task_in_input)
+        in_features, out_features, n_tasks, hidden, activation, layer_norm = shape
         in_features += n_tasks * task_in_input
         self.n_modules, self.activation = n_modules, activation()
         width = hidden[-1]
