@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from sb3_ars.core.objectives import ActorValue
 from sb3_ars.core.reward_scale import parse_reward_scaling
 from sb3_ars.errors import ConfigError, check_count, nearest
+from sb3_ars.nets.lora import LoRAConfig
 
 __all__ = [
     "ARSConfig",
@@ -18,11 +19,13 @@ __all__ = [
     "Precision",
     "ResetScope",
     "RewardScaling",
+    "TaskWeighting",
 ]
 
 ResetScope = Literal["actor_critic", "critic", "none"]
 RewardScaling = Literal["mean", "std", "normalization", "none"] | float | tuple[float, ...] | dict[str, float]
 Gradient = Literal["mean", "pcgrad"]
+TaskWeighting = Literal["equal", "temperature"]
 Precision = Literal["auto", "fp32", "tf32", "bf16"]
 Execution = Literal["auto", "eager", "fused", "compile", "cudagraph"]
 
@@ -50,6 +53,12 @@ class ARSConfig:
     """Critics the actor's loss reads: "all" (SB3's reduction) or "first" (the authors' code)."""
     gradient: Gradient = "mean"
     """How the tasks' losses become one gradient: their "mean", or "pcgrad" (conflicting gradients projected)."""
+    task_weighting: TaskWeighting = "equal"
+    """Weight of a task's losses: "equal", or n_tasks softmax(-log alpha_i) by "temperature" (Soft Modularization)."""
+    max_task_loss: float | None = None
+    """Leave a task out of an update when its critic loss exceeds this, and mix its PaCo parameters anew; None never."""
+    lora: dict[str, Any] | None = None
+    """Low-rank adapters late in the run: fields of sb3_ars.nets.lora.LoRAConfig, such as {"rank": 8}; None is none."""
 
     def __post_init__(self) -> None:
         if self.n_reset is not None:
@@ -64,6 +73,11 @@ class ARSConfig:
         _check_choice("reset", self.reset, (*get_args(ResetScope), None))
         _check_choice("actor_value", self.actor_value, get_args(ActorValue))
         _check_choice("gradient", self.gradient, get_args(Gradient))
+        _check_choice("task_weighting", self.task_weighting, get_args(TaskWeighting))
+        if self.max_task_loss is not None:
+            _check_positive("max_task_loss", self.max_task_loss)
+        if self.lora is not None:
+            LoRAConfig.of(self.lora)
         if self.param_resets is not None:
             _check_param_resets(self.param_resets)
         if isinstance(self.reward_scaling, str):  # numbers are checked once the tasks are known

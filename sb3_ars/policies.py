@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal
 
 import torch as th
@@ -24,6 +26,7 @@ from torch import nn
 from sb3_ars.errors import ConfigError
 from sb3_ars.nets.bodies import body_config, build_body
 from sb3_ars.nets.layers import ByTask
+from sb3_ars.nets.lora import LoRAConfig, LoRALinear, TaskOfRows, adapters, add_adapters, renew_adapters
 from sb3_ars.nets.mlp import MLP, with_layer_norm, xavier_
 
 __all__ = [
@@ -41,7 +44,33 @@ WeightInit = Literal["torch", "xavier"]
 _SOFTPLUS_STD_MIN = 1e-5  # the authors' code adds it to the softplus
 
 
-class _TaskActor:
+class _Adaptable:
+    """Mixin for actors and critics that may get adapters per task."""
+
+    task_of_rows: TaskOfRows | None = None
+    n_tasks: int = 1
+
+    def add_adapters(self, config: LoRAConfig, n_tasks: int) -> None:
+        """Freeze the network and add adapters to it; its outputs stay.
+
+        :param config: options
+        :param n_tasks: how many of an observation's last entries are the one-hot
+        """
+        assert isinstance(self, nn.Module)
+        self.task_of_rows, self.n_tasks = add_adapters(self, config, n_tasks), n_tasks
+
+    def _task(self, obs: Any) -> th.Tensor:
+        one_hot: th.Tensor = obs[:, -self.n_tasks :]
+        return one_hot
+
+    def _told_of_tasks(self, obs: Any, task_major: bool) -> AbstractContextManager[None]:
+        """Return a context in which the adapters know each row's task."""
+        if self.task_of_rows is None or task_major:
+            return nullcontext()
+        return self.task_of_rows.rows(self._task(obs))
+
+
+class _TaskActor(_Adaptable):
     """Mixin for SB3's actors: a choice of how the standard deviation is parametrised, and of a body that sees tasks."""
 
     std: StdParametrization = "exp"
@@ -57,8 +86,9 @@ class _TaskActor:
         if isinstance(self.latent_pi, ByTask):
             mean, rho = self.latent_pi(features, task_major).chunk(2, dim=1)
         else:
-            latent = self.latent_pi(features)
-            mean, rho = self.mu(latent), self.log_std(latent)
+            with self._told_of_tasks(obs, task_major):
+                latent = self.latent_pi(features)
+                mean, rho = self.mu(latent), self.log_std(latent)
         if self.std == "exp":
             return mean, th.clamp(rho, LOG_STD_MIN, LOG_STD_MAX)
         return mean, (nn.functional.softplus(rho) + _SOFTPLUS_STD_MIN).log()
@@ -75,8 +105,10 @@ class ARSTQCActor(_TaskActor, TQCActor):
     """sb3-contrib's TQC actor with our options."""
 
 
-class _TaskCritic:
+class _TaskCritic(_Adaptable):
     """Mixin for SB3's critics: all values as one tensor."""
+
+    value_scale: th.Tensor | None  # (n_tasks,), with adapters: c_i now over c_i when the base was frozen
 
     def q_values(self, obs: PyTorchObs, actions: th.Tensor, task_major: bool = False) -> th.Tensor:
         """Return ``(rows, n_critics, n_outputs)``.
@@ -89,7 +121,11 @@ class _TaskCritic:
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)
         x = th.cat([features, actions], dim=1)
-        values = [net(x, task_major) if isinstance(net, ByTask) else net(x) for net in self.q_networks]
+        with self._told_of_tasks(obs, task_major):
+            values = [net(x, task_major) if isinstance(net, ByTask) else net(x) for net in self.q_networks]
+        if self.value_scale is not None:
+            of_row = (self._task(obs) * self.value_scale).sum(dim=1, keepdim=True)
+            values = [value * of_row for value in values]
         return self._stacked(values)
 
     def _stacked(self, values: list[th.Tensor]) -> th.Tensor:
@@ -105,12 +141,24 @@ class ARSSACCritic(_TaskCritic, ContinuousCritic):
         # critic by critic, so that each critic's gradient is contiguous and sums in SB3's order
         return th.stack(values, dim=0).transpose(0, 1)
 
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """Return each critic's values, ``(rows, 1)``, as SB3 does."""
+        return self.q_values(obs, actions).unbind(dim=1)
+
+    def q1_forward(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """Return the first critic's values, ``(rows, 1)``, as SB3 does."""
+        return self.q_values(obs, actions)[:, 0]
+
 
 class ARSTQCCritic(_TaskCritic, QuantileCritic):
     """sb3-contrib's quantile critics under the name the update knows."""
 
     def _stacked(self, values: list[th.Tensor]) -> th.Tensor:
         return th.stack(values, dim=1)
+
+    def forward(self, obs: PyTorchObs, action: th.Tensor) -> th.Tensor:
+        """Return ``(rows, n_critics, n_quantiles)``, as sb3-contrib does."""
+        return self.q_values(obs, action)
 
 
 class _PolicyOptions:
@@ -129,6 +177,8 @@ class _PolicyOptions:
         :mod:`sb3_ars.nets.bodies`
     :param critic_body: the same for the critics; ``"same"`` is ``body``, ``None`` the plain network
     :param n_tasks: how many of an observation's last entries are the one-hot; the algorithm sets it
+    :param lora: adapters on frozen networks, :class:`~sb3_ars.nets.lora.LoRAConfig`'s fields; the algorithm sets it
+        once they are enabled, so that a saved model loads with them
     :param kwargs: SB3's remaining policy options
 
     Source: paper, Table 8 and section 4.3.
@@ -136,6 +186,13 @@ class _PolicyOptions:
 
     actor_class: type[Actor]
     critic_class: type[nn.Module]
+
+    # SB3's, which __init__ makes
+    actor: Any
+    critic: Any
+    critic_target: Any
+    optimizer_class: type[th.optim.Optimizer]
+    optimizer_kwargs: dict[str, Any]
 
     def __init__(
         self,
@@ -151,6 +208,7 @@ class _PolicyOptions:
         body: dict[str, Any] | None = None,
         critic_body: dict[str, Any] | Literal["same"] | None = "same",
         n_tasks: int = 1,
+        lora: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         for option, value, allowed in (
@@ -170,6 +228,8 @@ class _PolicyOptions:
         self.critic_body: Any = body if critic_body == "same" else critic_body
         if net_arch is None:
             net_arch = [400, 400, 400, 400] if body is None else list(body_config(body).net_arch)
+        self.lora: dict[str, Any] | None = None
+        _check_bodies(self.body, self.critic_body, lora)
         self._given_activations = (activation_fn, critic_activation_fn)
         self._critic_activation_fn = critic_activation_fn or activation_fn or nn.Tanh
         super().__init__(
@@ -180,6 +240,43 @@ class _PolicyOptions:
             activation_fn=activation_fn or nn.ReLU,
             **kwargs,
         )
+        if lora is not None:
+            self.enable_lora(lora)
+
+    def enable_lora(self, options: Mapping[str, Any]) -> None:
+        """Freeze actor, critics and target critics, add adapters, and give new optimizers those alone.
+
+        Outputs stay as they are. The target critics start with the critics' A, for B A moves slowly only from one A.
+
+        :param options: fields of :class:`~sb3_ars.nets.lora.LoRAConfig`
+        :raises ConfigError: for wrong options, networks other than the plain one, or adapters that are there already
+        """
+        config = LoRAConfig.of(options)
+        _check_bodies(self.body, self.critic_body, options)
+        for network in (self.actor, self.critic, self.critic_target):
+            network.add_adapters(config, self.n_tasks)
+        for critic in (self.critic, self.critic_target):
+            if config.rescale_critic:
+                critic.value_scale = th.ones(self.n_tasks, device=self.device)  # type: ignore[attr-defined]  # SB3's
+        self.lora = dict(options)
+        self._share_adapters()
+        for network in (self.actor, self.critic):
+            lr = float(network.optimizer.param_groups[0]["lr"])
+            network.optimizer = self.optimizer_class(adapters(network), lr=lr, **self.optimizer_kwargs)  # type: ignore[call-arg]  # every optimizer but the base class has lr
+
+    def renew_lora(self) -> None:
+        """Give the adapters fresh values in place: the networks are their frozen base again."""
+        for network in (self.actor, self.critic, self.critic_target):
+            renew_adapters(network)
+        self._share_adapters()
+
+    @th.no_grad()
+    def _share_adapters(self) -> None:
+        """Give the target critics the critics' A."""
+        pairs = zip(self.critic.modules(), self.critic_target.modules(), strict=True)
+        for layer, target in pairs:
+            if isinstance(layer, LoRALinear):
+                target.lora_a.copy_(layer.lora_a)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)  # type: ignore[attr-defined]
@@ -198,6 +295,7 @@ class _PolicyOptions:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)  # type: ignore[attr-defined]
         critic: Any = self.critic_class(**{**kwargs, "activation_fn": self._critic_activation_fn})
         critic.q_networks = [self._critic_network(critic, net) for net in critic.q_networks]
+        critic.register_buffer("value_scale", None)
         for index, net in enumerate(critic.q_networks):
             setattr(critic, f"qf{index}", net)
         if self.weight_init == "xavier":
@@ -241,8 +339,23 @@ class _PolicyOptions:
             body=self.body,
             critic_body=self.critic_body,
             n_tasks=self.n_tasks,
+            lora=self.lora,
         )
         return data
+
+
+def _check_bodies(
+    body: Mapping[str, Any] | None, critic_body: Mapping[str, Any] | None, lora: Mapping[str, Any] | None
+) -> None:
+    if body is not None and body.get("name") == "popart":
+        raise ConfigError(
+            "body='popart' is an output layer of critics; give it as critic_body, and leave body None."
+        )
+    if lora is not None and (body is not None or critic_body is not None):
+        raise ConfigError(
+            f"lora adapts the plain network's linear layers, but body={body!r} and critic_body={critic_body!r} have "
+            "parameters of other kinds, which would stay frozen. Use lora with the plain network."
+        )
 
 
 class ARSSACPolicy(_PolicyOptions, SACPolicy):

@@ -87,6 +87,48 @@ def test_captured_and_compiled_updates_are_the_eager_ones(algorithm, layer_norm,
     assert (eager - found).norm() < 1e-2 * (eager - before).norm()
 
 
+METHODS = {
+    "pcgrad": ({}, {"gradient": "pcgrad"}),
+    "multi_head": ({"body": {"name": "multi_head"}}, {}),
+    "soft_modules": ({"body": {"name": "soft_modules"}}, {"task_weighting": "temperature"}),
+    "moore": ({"body": {"name": "moore"}}, {}),
+    "paco": ({"body": {"name": "paco"}}, {"max_task_loss": 0.3}),
+    "popart": ({"critic_body": {"name": "popart", "update_period": 3}}, {"reward_scaling": "none"}),
+    "lora": (
+        {},
+        {"lora": {"rank": 4, "start": 0.5, "min_success": 0}, "param_resets": [160], "n_reset": None},
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore")  # torch.compile's about torch
+@pytest.mark.parametrize("algorithm", [ARSSAC, ARSTQC])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("execution", ["cudagraph", "compile"])
+def test_every_method_is_captured_and_compiled_as_it_runs_eagerly(execution, method, algorithm):
+    policy, options = METHODS[method]
+    results = []
+    for how, n_updates in (("eager", 0), ("eager", 40), (execution, 40)):
+        model = _model(algorithm, how, policy, options)
+        model.learn(200)
+        th.cuda.manual_seed(7)
+        model.train(gradient_steps=n_updates, batch_size=16)
+        results.append(th.cat([p.detach().flatten().cpu() for p in model.policy.parameters()]))
+    before, eager, found = results
+    assert (eager - found).norm() < 1e-2 * (eager - before).norm()
+
+
+def _model(algorithm, execution, policy, options):
+    defaults = {"n_reset": 0, "learning_starts": 100, "precision": "fp32", "overlap": False}
+    return algorithm(
+        "MlpPolicy",
+        make_toy_env(seed=0),
+        device="cuda",
+        execution=execution,
+        **{**SMALL, **defaults, **options, "policy_kwargs": {"net_arch": [32, 32], **policy}},
+    )
+
+
 def test_a_captured_run_updates_resets_and_logs_as_an_eager_one(tmp_path):
     models = [trained(execution=execution) for execution in ("eager", "cudagraph")]
     assert models[1]._plan.execution == "cudagraph" and models[1]._captured_updates._captured

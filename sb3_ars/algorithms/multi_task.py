@@ -11,7 +11,7 @@ import pathlib
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any, TypeVar
@@ -47,6 +47,7 @@ from sb3_ars.config import (
     Precision,
     ResetScope,
     RewardScaling,
+    TaskWeighting,
 )
 from sb3_ars.core.gradients import MeanGradient, PCGrad
 from sb3_ars.core.objectives import ActorValue, Objective
@@ -56,7 +57,11 @@ from sb3_ars.core.runner import CapturedCalls, compiled, prepare_optimizer_, tf3
 from sb3_ars.core.update import Hyperparameters, Metrics, Noise, Timer, UpdateState, update
 from sb3_ars.envs import make_multitask_env
 from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, check_count
+from sb3_ars.nets.layers import ByTask
+from sb3_ars.nets.lora import LoRAConfig, layers_to_adapt
 from sb3_ars.nets.mlp import set_arithmetic
+from sb3_ars.nets.paco import PaCo
+from sb3_ars.nets.popart import PopArtNetwork, PopArtNormalizer
 
 __all__ = ["MultiTaskOffPolicyAlgorithm"]
 
@@ -92,6 +97,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param updates_after_reset: gradient steps right after a reset
     :param actor_value: critics the actor's loss reads: ``"all"`` (SB3's reduction) or ``"first"``
     :param gradient: ``"mean"`` of the tasks' losses, or ``"pcgrad"``
+    :param task_weighting: ``"equal"``, or by ``"temperature"``
+    :param max_task_loss: critic loss above which a task is left out of an update
+    :param lora: low-rank adapters late in the run, such as ``{"rank": 8}``
 
     and of :class:`sb3_ars.config.ExecutionConfig`, which change speed and rounding:
 
@@ -122,6 +130,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     updates_after_reset: int
     actor_value: ActorValue
     gradient: Gradient
+    task_weighting: TaskWeighting
+    max_task_loss: float | None
+    lora: dict[str, Any] | None
 
     # ExecutionConfig's, likewise
     precision: Precision
@@ -173,6 +184,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         execution: Execution = "auto",
         overlap: bool | None = None,
         gradient: Gradient = "mean",
+        task_weighting: TaskWeighting = "equal",
+        max_task_loss: float | None = None,
+        lora: dict[str, Any] | None = None,
     ) -> None:
         config = ARSConfig(
             n_reset,
@@ -183,6 +197,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             updates_after_reset,
             actor_value,
             gradient,
+            task_weighting,
+            max_task_loss,
+            lora,
         )
         execution_config = ExecutionConfig(precision, execution, overlap)
         is_auto = _is_auto(learning_starts)
@@ -226,6 +243,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.is_multi_task = False
         self.n_resets = 0
         self.resets_looked_for_until = 0
+        self.active_tasks: list[int] | None = None  # None is all
+        self.schedule_state: dict[str, Any] | None = None  # TaskScheduleCallback's
         self.scaled_by: str | None = None  # the reward_scaling that c_i comes from
         self.reward_scale_history: list[tuple[int, list[float]]] = []
         if _init_setup_model:
@@ -245,13 +264,14 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             self.learning_starts = self._auto_learning_starts = 0
         self._check_options()
         self._read_tasks(self.env)
-        if self._bodies():
+        if self._bodies() or self.lora is not None:
             self.policy_kwargs["n_tasks"] = self.n_tasks
         if self.is_multi_task and self._uses_task_buffer():
             self.replay_buffer_class = self.replay_buffer_class or TaskReplayBuffer
             if self.replay_buffer is None:
                 self.replay_buffer = self._make_task_buffer(self.replay_buffer_class)
         super()._setup_model()
+        self._check_lora()
         if self.log_ent_coef is not None and self.n_tasks > 1:
             self._make_temperature_per_task(self.log_ent_coef)
         self.reward_scale = RewardScale(self.n_tasks, self.device)
@@ -332,16 +352,52 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
                 "VecNormalize(norm_reward=True) normalises rewards with one statistic for all tasks; the reward scale "
                 "needs raw rewards. Use VecNormalize(norm_reward=False) and choose reward_scaling instead."
             )
-        parse_reward_scaling(self.reward_scaling, names)
-        if self.gradient != "mean" and len(names) < 2:
+        if normalizer is not None and normalizer.norm_obs and (self._bodies() or self.lora is not None):
             raise ConfigError(
-                f"gradient={self.gradient!r} projects one task's gradient on another's; with one task use 'mean'."
+                "VecNormalize(norm_obs=True) changes the one-hot task id, which body, critic_body and lora read. Use "
+                "norm_obs=False, or the plain network."
             )
+        parse_reward_scaling(self.reward_scaling, names)
+        self._check_methods(len(names))
         if self.batch_size > self.buffer_size:
             raise ConfigError(
                 f"batch_size={self.batch_size} rows per task is more than buffer_size={self.buffer_size} per task "
                 "can ever hold; raise buffer_size or lower batch_size."
             )
+
+    def _check_methods(self, n_tasks: int) -> None:
+        """Raise where methods exclude each other or need several tasks."""
+        if self.gradient != "mean" and n_tasks < 2:
+            raise ConfigError(
+                f"gradient={self.gradient!r} projects one task's gradient on another's; with one task use 'mean'."
+            )
+        is_learned = isinstance(self.ent_coef, str)  # type: ignore[attr-defined]  # SAC's and TQC's
+        if self.task_weighting != "equal" and (n_tasks < 2 or not is_learned):
+            raise ConfigError(
+                f"task_weighting={self.task_weighting!r} compares the tasks' learned temperatures, so it needs several "
+                "tasks and ent_coef='auto'; use task_weighting='equal'."
+            )
+        critic_body = self.policy_kwargs.get("critic_body")
+        is_popart = isinstance(critic_body, dict) and critic_body.get("name") == "popart"
+        if is_popart and self.reward_scaling not in (None, "none"):
+            raise ConfigError(
+                f"critic_body='popart' normalises each task's values, and reward_scaling={self.reward_scaling!r} would "
+                "scale the same rewards again. Use reward_scaling='none' with PopArt, or another critic_body."
+            )
+
+    def _check_lora(self) -> None:
+        """Raise now, not when the adapters are due, if the networks cannot have them."""
+        if self.lora is None:
+            return
+        if not self.config.resets():
+            raise ConfigError(
+                "lora is enabled at a reset time, but reset='none' has none; use 'actor_critic'."
+            )
+        if self._bodies():
+            raise ConfigError(f"lora adapts the plain network; leave {' and '.join(self._bodies())} out.")
+        if not self.lora_is_enabled:
+            for network in (self.actor, self.critic):
+                layers_to_adapt(network, LoRAConfig.of(self.lora))
 
     def _bodies(self) -> list[str]:
         """Return the policy options that ask for a network which sees the task."""
@@ -352,6 +408,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Refuse, for a plain environment, what needs to know the tasks."""
         wanted = [f"policy_kwargs[{name!r}]" for name in self._bodies()]
         wanted += ["gradient"] if self.gradient != "mean" else []
+        wanted += ["task_weighting"] if self.task_weighting != "equal" else []
+        wanted += ["max_task_loss"] if self.max_task_loss is not None else []
+        wanted += ["lora"] if self.lora is not None else []
         if wanted:
             raise ConfigError(
                 f"{wanted[0]} needs an environment with named tasks; make it with make_multitask_env or "
@@ -384,6 +443,13 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _make_update_state(self) -> UpdateState:
         actor, critic, critic_target = self.actor, self.critic, self.critic_target
+        bodies = [
+            module.body
+            for network in (actor, critic, critic_target)
+            for module in network.modules()
+            if isinstance(module, ByTask)
+        ]
+        popart = [body for body in bodies if isinstance(body, PopArtNetwork)]
         if self._plan.execution == "compile":
             actor = compiled(actor, "action_distribution")
             critic, critic_target = compiled(critic, "q_values"), compiled(critic_target, "q_values")
@@ -398,6 +464,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             ent_coef_optimizer=self.ent_coef_optimizer,
             norm_statistics=self.batch_norm_stats,  # type: ignore[attr-defined]  # SAC's and TQC's
             norm_statistics_target=self.batch_norm_stats_target,  # type: ignore[attr-defined]
+            normalizer=PopArtNormalizer(popart) if popart else None,
+            mixtures=[body for body in bodies if isinstance(body, PaCo)],
         )
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
@@ -452,6 +520,44 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if isinstance(self.replay_buffer, TaskReplayBuffer):
             self.replay_buffer.set_task_of_env(self.task_of_env)
 
+    def set_active_tasks(self, tasks: Sequence[str | int] | None) -> None:
+        """Collect from these tasks only, from the next step on; updates go on over all tasks' buffers.
+
+        An inactive task's episode waits, and goes on where it stood. Environment steps count what is collected. To be
+        called between two rollouts (``on_rollout_start``).
+
+        :param tasks: names or indices; ``None`` is all
+        :raises ConfigError: for an unknown task, none at all, or an environment that can only step as a whole
+        """
+        indices = None if tasks is None else sorted({self._task_index(task) for task in tasks})
+        if indices == []:
+            raise ConfigError(
+                "set_active_tasks([]) would collect nothing; name at least one task, or None for all."
+            )
+        env: Any = self.env
+        buffer = self.replay_buffer
+        if not isinstance(buffer, TaskReplayBuffer) or not hasattr(env, "set_active_tasks"):
+            raise ConfigError(
+                "set_active_tasks needs the environment of make_multitask_env(functions), make_metaworld_env or "
+                "make_toy_env, whose tasks can be stepped one without the others."
+            )
+        env.set_active_tasks(indices)
+        buffer.set_active_tasks(indices)
+        self.active_tasks = indices
+
+    def _n_active_envs(self) -> int:
+        """Return how many environments a vector step steps."""
+        if self.active_tasks is None:
+            return self.n_envs
+        return sum(self.task_of_env.count(task) for task in self.active_tasks)
+
+    def _task_index(self, task: str | int) -> int:
+        names = self.task_names or []
+        index: Any = names.index(task) if task in names else task
+        if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(names):
+            raise ConfigError(f"task={task!r} is not one of this model's tasks: {names}.")
+        return int(index)
+
     # ------------------------------------------------------------------ learning
 
     def learn(
@@ -500,6 +606,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._resolve_learning_starts(total_timesteps, starts_afresh)
         if isinstance(self.replay_buffer, TaskReplayBuffer):
             self.replay_buffer.check_memory()
+        if self.active_tasks is not None:  # a loaded model's environment and buffer know nothing of it
+            self.set_active_tasks(self.active_tasks)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _resolve_learning_starts(self, total_timesteps: int, starts_afresh: bool) -> None:
@@ -568,6 +676,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self._stepping_env is None or self._stepping_env.venv is not env:
             self._stepping_env = WorkWhileStepping(env)
         self._stepping_env.timer = self.timer
+        self._stepping_env.num_envs = self._n_active_envs()  # what a step counts as
         self._stepping_env.work = partial(self._train_for, train_freq) if self._plan.overlap else None
         self._updates_are_done = False
         rollout = super().collect_rollouts(
@@ -585,7 +694,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _train_for(self, train_freq: TrainFreq) -> None:
         """Do the updates that one rollout is worth."""
         gradient_steps = (
-            self.gradient_steps if self.gradient_steps >= 0 else train_freq.frequency * self.n_envs
+            self.gradient_steps if self.gradient_steps >= 0 else train_freq.frequency * self._n_active_envs()
         )
         if self.num_timesteps > self.learning_starts and gradient_steps > 0:
             self.train(gradient_steps, self.batch_size)
@@ -595,7 +704,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         try:
             with self.timer("act"):
-                actions, buffer_actions = super()._sample_action(learning_starts, action_noise, n_envs)
+                # SB3 2.9.2 (off_policy_algorithm.py) asks for as many actions as it counts steps
+                actions, buffer_actions = super()._sample_action(learning_starts, action_noise, self.n_envs)
                 # torch's Normal refuses a mean of NaN, unless something in the process has used torch.compile
                 if not np.isfinite(buffer_actions).all():
                     raise ValueError("the actor gave NaN or infinity")
@@ -657,37 +767,51 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
         hyperparameters = Hyperparameters(
-            self.gamma, self.tau, float(self.target_entropy), self._make_objective(), self._combiner
+            self.gamma,
+            self.tau,
+            float(self.target_entropy),
+            self._make_objective(),
+            self._combiner,
+            self.task_weighting == "temperature",
+            self.max_task_loss,
         )
+        normalizer = self._update_state.normalizer
+        refresh_period = 1 if normalizer is None else normalizer.update_period
         with tf32(self._plan.tf32):
             for _ in range(gradient_steps):
                 # counted over the whole run; SB3 2.9.2 counts within one train() call (sac.py), so 1 step never waits
-                update_target = self._n_updates % self.target_update_interval == 0
-                metrics = self._execute(hyperparameters, batch_size, update_target)
+                variant = (
+                    self._n_updates % self.target_update_interval == 0,
+                    self._n_updates % refresh_period == 0,
+                )
+                metrics = self._execute(hyperparameters, batch_size, variant)
                 self._n_updates += 1
                 with self.timer("log"):
                     self._task_log.add_update(metrics)
 
-    def _execute(self, hyperparameters: Hyperparameters, batch_size: int, update_target: bool) -> Metrics:
-        """Run one update as planned."""
+    def _execute(
+        self, hyperparameters: Hyperparameters, batch_size: int, variant: tuple[bool, bool]
+    ) -> Metrics:
+        """Run one update as planned.
+
+        :param variant: whether the target critics move, and whether the normalizer does
+        """
         if self._plan.execution != "cudagraph":
-            return self._sample_and_update(hyperparameters, batch_size, update_target, self.timer)
-        step = partial(self._sample_and_update, hyperparameters, batch_size, update_target, nullcontext)
+            return self._sample_and_update(hyperparameters, batch_size, variant, self.timer)
+        step = partial(self._sample_and_update, hyperparameters, batch_size, variant, nullcontext)
         buffer: Any = self.replay_buffer
         frozen = (hyperparameters, batch_size, id(buffer), buffer.storage_version)
         with self.timer("update"):
-            return self._captured_updates(step, update_target, frozen, [buffer.generator])
+            return self._captured_updates(step, variant, frozen, [buffer.generator])
 
     def _sample_and_update(
-        self, hyperparameters: Hyperparameters, batch_size: int, update_target: bool, timer: Timer
+        self, hyperparameters: Hyperparameters, batch_size: int, variant: tuple[bool, bool], timer: Timer
     ) -> Metrics:
         assert self.replay_buffer is not None
         with timer("sample"):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
         noise = self._draw_noise(batch.actions)
-        return update(
-            self._update_state, batch, noise, self.reward_scale, hyperparameters, update_target, timer
-        )
+        return update(self._update_state, batch, noise, self.reward_scale, hyperparameters, *variant, timer)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         """Set the learning rate, as SB3 does, but in place where it lives on the device."""
@@ -703,10 +827,14 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _draw_noise(self, actions: th.Tensor) -> Noise:
         """Return what is random in one update, the actions' noise first and in the order SB3 draws it."""
         noise = th.randn_like(actions), th.randn_like(actions)
-        if self.gradient == "mean":
-            return Noise(*noise)
-        shape = (self.n_tasks, self.n_tasks)
-        return Noise(*noise, *(th.rand(shape, device=self.device) for _ in range(2)))
+        uniform = partial(th.rand, self.n_tasks, self.n_tasks, device=self.device)
+        projects, mixes = self.gradient != "mean", bool(self._update_state.mixtures)
+        return Noise(
+            *noise,
+            critic_order=uniform() if projects else None,
+            actor_order=uniform() if projects else None,
+            mixture=uniform() if mixes and self.max_task_loss is not None else None,
+        )
 
     def has_batch(self) -> bool:
         """Return whether the buffer holds a batch of every task; a run resumed without its buffer does not at first."""
@@ -733,7 +861,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :raises ConfigError: if the rule is undefined for the rewards seen; networks and buffers are untouched
         """
         rule = parse_reward_scaling(self.reward_scaling, self.task_names or ["environment"])
+        before = self.reward_scale.scale.clone()
         self.reward_scale.update_(*rule(self._reward_statistics(), self.reward_floor))
+        for critic in (self.critic, self.critic_target):
+            if critic.value_scale is not None:  # a frozen base goes on in the units it learned
+                critic.value_scale.mul_(self.reward_scale.scale / before)
         self.scaled_by = repr(self.reward_scaling)
         self.reward_scale_history.append((self.num_timesteps, self.reward_scale.scale.tolist()))
 
@@ -749,9 +881,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self.reset in (None, "none"):
             return
         self.n_resets += 1
-        entropy = np.random.SeedSequence(None if self.seed is None else [self.seed, self.n_resets])
-        with th.random.fork_rng(devices=[self.device] if self.device.type == "cuda" else []):
-            th.manual_seed(int(entropy.generate_state(1)[0]))
+        with self._seeded_by(self.n_resets):
             fresh: Any = self.policy_class(
                 self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
             ).to(self.device)
@@ -765,6 +895,51 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             reset_module_(self.actor, fresh.actor)
             reset_optimizer_(self.actor.optimizer)
             self._reset_temperature()
+
+    @contextmanager
+    def _seeded_by(self, number: int) -> Iterator[None]:
+        """Draw from a stream of the model's seed and a number; torch's global one goes on as if nothing was drawn."""
+        entropy = np.random.SeedSequence(None if self.seed is None else [self.seed, number])
+        with th.random.fork_rng(devices=[self.device] if self.device.type == "cuda" else []):
+            th.manual_seed(int(entropy.generate_state(1)[0]))
+            yield
+
+    def mean_success(self) -> float:
+        """Return the mean over tasks of the latest training episodes' success; NaN while a task has none."""
+        return self._task_log.mean_success()
+
+    @property
+    def lora_is_enabled(self) -> bool:
+        """Whether the networks are frozen but for their adapters."""
+        return self.policy_kwargs.get("lora") is not None
+
+    def enable_lora(self) -> None:
+        """Freeze the networks and add the adapters that ``lora`` asks for; outputs stay as they are.
+
+        Everything saved from now on loads with them.
+
+        :raises ConfigError: without ``lora``, or if adapters are there already
+        """
+        if self.lora is None or self.lora_is_enabled:
+            raise ConfigError(f"enable_lora() needs the option lora, once: lora={self.lora!r}.")
+        policy: Any = self.policy
+        with self._seeded_by(self.n_resets + 1):
+            policy.enable_lora(self.lora)
+        self.policy_kwargs["lora"] = dict(self.lora)
+        self._lora_changed()
+
+    def renew_lora(self) -> None:
+        """Start the adapters afresh on their frozen base, with new moments in their optimizers; layer norms stay."""
+        policy: Any = self.policy
+        with self._seeded_by(self.n_resets + 1):
+            policy.renew_lora()
+        for optimizer in (self.actor.optimizer, self.critic.optimizer):
+            reset_optimizer_(optimizer)
+        self._lora_changed()
+
+    def _lora_changed(self) -> None:
+        self.n_resets += 1
+        self._prepare_execution()
 
     def _reset_temperature(self) -> None:
         if self.log_ent_coef is None or self.ent_coef_optimizer is None:
@@ -788,7 +963,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             return  # SB3 asks once per ended episode, and the horizons of several tasks end together
         self._last_dump_at = self.num_timesteps
         with self.timer("log"):
-            self._task_log.record(self.logger, self._n_updates, self.log_ent_coef is not None)
+            self._task_log.record(
+                self.logger, self._n_updates, self.log_ent_coef is not None, self.max_task_loss is not None
+            )
             if self.is_multi_task:
                 assert isinstance(self.replay_buffer, TaskReplayBuffer)
                 self._task_log.record_scale(
@@ -858,18 +1035,10 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         )
 
     def _with_task(self, observation: Any, task: str | int) -> np.ndarray:
-        names = self.task_names or []
-        index: Any = names.index(task) if task in names else task
-        if (
-            isinstance(observation, dict)
-            or not isinstance(index, int | np.integer)
-            or not 0 <= index < len(names)
-        ):
-            raise ConfigError(f"task={task!r} is not one of this model's tasks: {names}.")
+        one_hot = np.eye(self.n_tasks, dtype=np.float32)[self._task_index(task)]
         observation = np.asarray(observation)
-        one_hot = np.eye(len(names), dtype=np.float32)[int(index)]
         return np.concatenate(
-            (observation, np.broadcast_to(one_hot, (*observation.shape[:-1], len(names)))), axis=-1
+            (observation, np.broadcast_to(one_hot, (*observation.shape[:-1], self.n_tasks))), axis=-1
         )
 
     @classmethod

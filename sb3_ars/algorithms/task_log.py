@@ -43,6 +43,19 @@ class TaskLog:
             episode["success"] = float(info["is_success"])
         self._episodes[task].append(episode)
 
+    def successes(self, task: int) -> list[float]:
+        """Return the success, 0 or 1, of the task's latest training episodes, oldest first.
+
+        :param task: index
+        """
+        return [episode["success"] for episode in self._episodes[task] if "success" in episode]
+
+    def mean_success(self) -> float:
+        """Return the mean over tasks of the latest training episodes' success; NaN while a task has none."""
+        return float(
+            np.mean([np.mean(self.successes(task) or [np.nan]) for task in range(len(self._episodes))])
+        )
+
     def add_update(self, metrics: Metrics) -> None:
         """Add one update's metrics to the running sums, on the device."""
         if self._sums is None:  # a copy: a captured update writes into the same tensors again
@@ -51,12 +64,15 @@ class TaskLog:
             th._foreach_add_(self._sums, metrics)
         self._n_updates += 1
 
-    def record(self, logger: Logger, n_updates: int, temperature_is_learned: bool) -> None:
+    def record(
+        self, logger: Logger, n_updates: int, temperature_is_learned: bool, tasks_are_left_out: bool = False
+    ) -> None:
         """Write means since the last call under SB3's keys and, per task, ours.
 
         :param logger: SB3's
         :param n_updates: gradient steps of the whole run
         :param temperature_is_learned: whether there is a temperature loss to report
+        :param tasks_are_left_out: whether a task may be left out of an update
         :raises DivergedError: if a loss is NaN or infinite
         """
         for key, values in self._episode_means().items():
@@ -65,7 +81,7 @@ class TaskLog:
                 logger.record("rollout/mean_success", float(np.nanmean(values)))
         if self._sums is None:
             return
-        actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value = (
+        actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value, left_out = (
             (tensor / self._n_updates).tolist() for tensor in self._sums
         )
         if not np.isfinite([actor_loss, critic_loss]).all():
@@ -82,6 +98,8 @@ class TaskLog:
         if self.task_names:
             self._record_tasks(logger, "q_value", q_value)
             self._record_tasks(logger, "ent_coef", np.broadcast_to(ent_coef, len(self.task_names)).tolist())
+            if tasks_are_left_out:
+                self._record_tasks(logger, "left_out", left_out)
         self._sums, self._n_updates = None, 0
 
     def record_scale(self, logger: Logger, reward_scale: th.Tensor, mean_reward: th.Tensor) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_ars.errors import ConfigError
+from sb3_ars.nets.lora import LoRAConfig
 
 if TYPE_CHECKING:
     from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
@@ -49,6 +50,13 @@ class ARSCallback(BaseCallback):
 
     def _check_reset_times(self) -> None:
         model, times = self.algorithm, self.reset_times
+        if model.lora is not None and not model.lora_is_enabled:
+            start = LoRAConfig.of(model.lora).start * model._total_timesteps
+            if not times or times[-1] < start:
+                raise ConfigError(
+                    f"lora adds its adapters at the first reset from step {start:.0f} on (lora option start), but the "
+                    f"resets are at {times}. Lower start, reset more often, or name the steps with param_resets."
+                )
         if not times:
             return
         if times[0] <= model.learning_starts or len(set(times)) < len(times):
@@ -97,15 +105,39 @@ class ARSCallback(BaseCallback):
         model = self.algorithm
         return any(model.resets_looked_for_until < time <= model.num_timesteps for time in self.reset_times)
 
-    def reset(self) -> None:
-        """Recompute c_i, reset the networks, do the extra updates (Algorithm 1, lines 14 to 17)."""
+    def lora_is_due(self) -> bool:
+        """Return whether this reset adds adapters instead: late enough, and with enough training success.
+
+        Deviation: the authors' code asks the latest evaluation, which a run here need not have.
+        """
         model = self.algorithm
+        if model.lora is None:
+            return False
+        config = LoRAConfig.of(model.lora)
+        is_late = model.num_timesteps >= config.start * model._total_timesteps
+        return is_late and (config.min_success == 0 or model.mean_success() >= config.min_success)
+
+    def reset(self) -> None:
+        """Reset the networks, recompute c_i, do the extra updates (Algorithm 1, lines 14 to 17).
+
+        Late in a run with ``lora`` the networks are not reset but adapted: adapters are added the first time, and start
+        afresh every time after.
+        """
+        model = self.algorithm
+        if model.lora_is_enabled:
+            model.renew_lora()
+            event = "adapters renewed"
+        elif self.lora_is_due():
+            model.enable_lora()
+            event = "adapters added"
+        else:
+            model.reset_networks()
+            event = f"reset {model.n_resets}"
         try:
             model.update_reward_scale()
         except ConfigError as error:  # a day of training is not thrown away because a mean turned negative
             warnings.warn(f"The reward scales stay as they were. {error}", stacklevel=2)
-        model.reset_networks()
-        self._print_scale(f"reset {model.n_resets}")
+        self._print_scale(event)
         if model.updates_after_reset > 0:
             model.train(gradient_steps=model.updates_after_reset, batch_size=model.batch_size)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch as th
 
-__all__ = ["per_row", "temperature_loss"]
+__all__ = ["per_row", "temperature_loss", "temperature_weight"]
 
 
 def temperature_loss(log_ent_coef: th.Tensor, log_prob: th.Tensor, target_entropy: float) -> th.Tensor:
@@ -25,6 +25,18 @@ def temperature_loss(log_ent_coef: th.Tensor, log_prob: th.Tensor, target_entrop
     return -(log_ent_coef.view(n_tasks, 1) * (log_prob.view(n_tasks, -1) + target_entropy).detach()).mean()
 
 
-def per_row(ent_coef: th.Tensor, n_rows: int) -> th.Tensor:
-    """Return each row's temperature, ``(n_rows, 1)``, from ``(n_tasks,)`` or a scalar."""
-    return ent_coef.view(-1, 1, 1).expand(-1, n_rows // ent_coef.numel(), 1).reshape(n_rows, 1)
+def per_row(per_task: th.Tensor, n_rows: int) -> th.Tensor:
+    """Return each row's number, ``(n_rows, 1)``, from ``(n_tasks,)`` or a scalar; rows are task-major."""
+    return per_task.view(-1, 1, 1).expand(-1, n_rows // per_task.numel(), 1).reshape(n_rows, 1)
+
+
+def temperature_weight(ent_coef: th.Tensor) -> th.Tensor:
+    """Return w_i = N softmax_i(-lambda_i), lambda_i = log alpha_i, whose mean is 1: an uncertain task weighs less.
+
+    :param ent_coef: alpha_i, ``(n_tasks,)``, positive
+    :return: ``(n_tasks,)``
+
+    Source: Yang et al. 2020, section 4.3, with the sign and the factor N that only their code shows.
+    """
+    # w_i = N exp(-lambda_i) / sum_j exp(-lambda_j)
+    return len(ent_coef) * th.softmax(-ent_coef.log(), dim=0)

@@ -17,7 +17,7 @@ from sb3_ars.core.gradients import GradientCombiner, MeanGradient
 from sb3_ars.core.objectives import Objective
 from sb3_ars.core.reward_scale import RewardScale
 from sb3_ars.core.targets import soft_target
-from sb3_ars.core.temperature import per_row, temperature_loss
+from sb3_ars.core.temperature import per_row, temperature_loss, temperature_weight
 
 __all__ = [
     "Batch",
@@ -79,6 +79,40 @@ class Batch(Protocol):
         """``(rows, 1)`` for n-step returns, otherwise ``None``."""
 
 
+class ValueNormalizer(Protocol):
+    """Shift and scale of each task's values, moved with the targets: PopArt's."""
+
+    @property
+    def mean(self) -> th.Tensor:
+        """``(n_tasks,)``, in units of the target."""
+
+    @property
+    def std(self) -> th.Tensor:
+        """``(n_tasks,)``, positive."""
+
+    @property
+    def update_period(self) -> int:
+        """Updates from one refresh to the next."""
+
+    def update_(self, target: th.Tensor, refresh: bool) -> None:
+        """Take in a batch's targets.
+
+        :param target: ``(rows, m)``, task-major
+        :param refresh: whether ``mean`` and ``std`` follow now
+        """
+
+
+class ParameterMixture(Protocol):
+    """A network whose tasks mix shared parameters: PaCo's."""
+
+    def reinitialize_(self, healthy: th.Tensor, uniform: th.Tensor) -> None:
+        """Mix the parameters of tasks that are not healthy anew from those that are.
+
+        :param healthy: ``(n_tasks,)``, bool
+        :param uniform: ``(n_tasks, n_tasks)``, from U(0, 1)
+        """
+
+
 @dataclass
 class UpdateState:
     """The tensors one update changes, all in place.
@@ -93,6 +127,8 @@ class UpdateState:
     :param ent_coef_optimizer: steps ``log_ent_coef``
     :param norm_statistics: running statistics of batch-norm layers in the critics
     :param norm_statistics_target: the same of the target critics
+    :param normalizer: in whose units the critics learn; ``None`` is the target's own
+    :param mixtures: networks in which a task left out of an update starts from others' parameters
     """
 
     actor: Actor
@@ -105,6 +141,8 @@ class UpdateState:
     ent_coef_optimizer: th.optim.Optimizer | None
     norm_statistics: Sequence[th.Tensor] = ()
     norm_statistics_target: Sequence[th.Tensor] = ()
+    normalizer: ValueNormalizer | None = None
+    mixtures: Sequence[ParameterMixture] = ()
 
     def __post_init__(self) -> None:
         self.critic_parameters: list[th.Tensor] = list(self.critic.parameters())
@@ -120,6 +158,8 @@ class Hyperparameters:
     :param target_entropy: H, in nats
     :param objective: SAC's or TQC's
     :param combiner: how the tasks' losses become one gradient, of the actor and of all critics together
+    :param weight_by_temperature: whether a task's losses weigh N softmax(-lambda_i) instead of 1
+    :param max_task_loss: a task whose critic loss is larger is left out of the update; ``None`` leaves none out
     """
 
     discount: float
@@ -127,6 +167,8 @@ class Hyperparameters:
     target_entropy: float
     objective: Objective
     combiner: GradientCombiner
+    weight_by_temperature: bool = False
+    max_task_loss: float | None = None
 
 
 class Noise(NamedTuple):
@@ -136,12 +178,14 @@ class Noise(NamedTuple):
     :param next_action: the same at s'
     :param critic_order: ``(n_tasks, n_tasks)``, U(0, 1), or ``None`` for combiners that need none
     :param actor_order: the same for the actor's gradient
+    :param mixture: the same for tasks left out; read only where there are ``mixtures``
     """
 
     action: th.Tensor
     next_action: th.Tensor
     critic_order: th.Tensor | None = None
     actor_order: th.Tensor | None = None
+    mixture: th.Tensor | None = None
 
 
 class Timer(Protocol):
@@ -161,6 +205,7 @@ class Metrics(NamedTuple):
     q_value: (
         th.Tensor
     )  # (n_tasks,), mean of Q(s, a) over critics, outputs and the task's rows, in scaled reward
+    left_out: th.Tensor  # (n_tasks,), 1 where the task's loss was too large for this update
 
 
 def update(
@@ -170,6 +215,7 @@ def update(
     reward_scale: RewardScale,
     hyperparameters: Hyperparameters,
     update_target: bool = True,
+    refresh_normalizer: bool = True,
     timer: Timer = contextlib.nullcontext,
 ) -> Metrics:
     """Change ``state`` by one gradient step on ``batch``.
@@ -182,7 +228,11 @@ def update(
     :param reward_scale: c_i
     :param hyperparameters: constants
     :param update_target: whether the target critics move in this step
+    :param refresh_normalizer: whether the normalizer's shift and scale move in this step
     :param timer: told which part is running: "actor", "critic", "targets"
+
+    A task left out has weight 0 in both losses. Deviation from PaCo: what decides is the critics' loss alone, for the
+    actor's comes after their step here.
 
     Source: paper, Eq. 3, 4 and 7; with one task, c = 1 and SB3's networks it is SB3's ``SAC.train``, or sb3-contrib's
     ``TQC.train``, to the bit.
@@ -220,30 +270,48 @@ def update(
                 next_log_prob,
                 reward_scale,
             )
+            if state.normalizer is not None:
+                state.normalizer.update_(target, refresh_normalizer)
         q = [
             state.critic.q_values(_rows(obs, group, n_rows), batch.actions[group], task_major)
             for group in groups
         ]
-        losses = [
-            objective.loss(values, target[group]).mean() for values, group in zip(q, groups, strict=True)
-        ]
+        if state.normalizer is None:
+            errors = [objective.loss(values, target[group]) for values, group in zip(q, groups, strict=True)]
+        else:
+            mean, std = (per_row(x, n_rows) for x in (state.normalizer.mean, state.normalizer.std))
+            target = (target - mean) / std
+            errors = [
+                objective.loss((values - mean[group, None]) / std[group, None], target[group])
+                for values, group in zip(q, groups, strict=True)
+            ]
+        weight = _task_weight(errors, ent_coef, n_tasks, hyperparameters)
+        losses = _weighted(errors, weight)
         critic_loss = _mean(losses)
         _step(state.critic_optimizer, losses, combiner, noise.critic_order)
 
     with timer("actor"):
-        losses = []
+        errors = []
         for group, (actions, own_log_prob) in zip(groups, sampled, strict=True):
             with _frozen(state.critic_parameters):
                 q_pi = state.critic.q_values(_rows(obs, group, n_rows), actions, task_major)
-            losses.append((row_ent_coef[group] * own_log_prob - objective.actor_value(q_pi)).mean())
+            errors.append(row_ent_coef[group] * own_log_prob - objective.actor_value(q_pi))
+        losses = _weighted(errors, weight)
         actor_loss = _mean(losses)
         _step(state.actor_optimizer, losses, combiner, noise.actor_order)
 
     with timer("targets"):
         if update_target:
             _move_target(state, hyperparameters.tau)
+        left_out = th.zeros(n_tasks, device=target.device)
+        if hyperparameters.max_task_loss is not None:
+            assert weight is not None
+            left_out = (weight == 0).float()
+            for mixture in state.mixtures:  # only now: a backward pass needs what the forward pass saw
+                assert noise.mixture is not None
+                mixture.reinitialize_(weight > 0, noise.mixture)
     q_value = th.cat([values.detach() for values in q]).reshape(n_tasks, -1).mean(dim=1)
-    return Metrics(actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value)
+    return Metrics(actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value, left_out)
 
 
 def squashed_gaussian(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -293,6 +361,35 @@ def _step(
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient
     optimizer.step()
+
+
+@th.no_grad()
+def _task_weight(
+    errors: Sequence[th.Tensor], ent_coef: th.Tensor, n_tasks: int, hyperparameters: Hyperparameters
+) -> th.Tensor | None:
+    """Return each task's weight in the losses, ``(n_tasks,)``; ``None`` where all weigh 1."""
+    weight = temperature_weight(ent_coef) if hyperparameters.weight_by_temperature else None
+    if hyperparameters.max_task_loss is None:
+        return weight
+    is_healthy = _per_task(errors, n_tasks) <= hyperparameters.max_task_loss  # NaN is not
+    return is_healthy.float() if weight is None else weight * is_healthy
+
+
+def _per_task(errors: Sequence[th.Tensor], n_tasks: int) -> th.Tensor:
+    """Return each task's mean, ``(n_tasks,)``, from one tensor per group of rows."""
+    of_group = n_tasks // len(errors)
+    return th.cat([error.reshape(of_group, -1).mean(dim=1) for error in errors])
+
+
+def _weighted(errors: Sequence[th.Tensor], weight: th.Tensor | None) -> list[th.Tensor]:
+    """Return one loss per group of rows: the mean over its tasks of weight times mean error."""
+    if weight is None:
+        return [error.mean() for error in errors]
+    losses = []
+    for error, of_tasks in zip(errors, weight.chunk(len(errors)), strict=True):
+        per_task = _per_task([error], len(of_tasks))
+        losses.append((th.where(of_tasks > 0, per_task, 0.0) * of_tasks).mean())
+    return losses
 
 
 _MEAN = MeanGradient()  # a temperature sees one task alone: nothing to combine

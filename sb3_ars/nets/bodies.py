@@ -13,6 +13,7 @@ from sb3_ars.nets.layers import Body, BodyShape
 from sb3_ars.nets.moore import MOORE
 from sb3_ars.nets.multi_head import MultiHead
 from sb3_ars.nets.paco import PaCo
+from sb3_ars.nets.popart import PopArtNetwork
 from sb3_ars.nets.soft_modules import SoftModules
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "MOOREConfig",
     "MultiHeadConfig",
     "PaCoConfig",
+    "PopArtConfig",
     "SoftModulesConfig",
     "body_config",
     "build_body",
@@ -41,13 +43,15 @@ class BodyConfig:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "task_in_input":
-                check_count(f"body {self.name!r}, option {field.name}", value)
-            elif not isinstance(value, bool):
-                raise ConfigError(
-                    f"body {self.name!r}, option task_in_input={value!r} must be True or False."
-                )
+            value, option = getattr(self, field.name), f"body {self.name!r}, option {field.name}"
+            if isinstance(field.default, bool):
+                if not isinstance(value, bool):
+                    raise ConfigError(f"{option}={value!r} must be True or False.")
+            elif isinstance(field.default, float):
+                if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 1:
+                    raise ConfigError(f"{option}={value!r} must be above 0 and at most 1.")
+            else:
+                check_count(option, value)
 
     def check(self, hidden: Sequence[int]) -> None:
         """Refuse hidden layers the body cannot be built from.
@@ -133,8 +137,25 @@ class PaCoConfig(BodyConfig):
     """Whether the input sees the one-hot besides the mixture."""
 
 
+@dataclass(frozen=True)
+class PopArtConfig(BodyConfig):
+    """A plain network with a normalised output per task (PopArt); for critics alone."""
+
+    name = "popart"
+    net_arch = (400, 400, 400, 400)
+    body_class = PopArtNetwork
+
+    update_period: int = 1
+    """Updates from one refresh of the normalisation to the next: 1, 10, 100 or 500 in the paper."""
+    rate: float = 3e-4
+    """Weight of each batch in the running mean and variance of the targets, beta."""
+    task_in_input: bool = True
+    """Whether the network sees the one-hot besides choosing the output by it."""
+
+
 BODIES: dict[str, type[BodyConfig]] = {
-    config.name: config for config in (MultiHeadConfig, SoftModulesConfig, MOOREConfig, PaCoConfig)
+    config.name: config
+    for config in (MultiHeadConfig, SoftModulesConfig, MOOREConfig, PaCoConfig, PopArtConfig)
 }
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, get_args
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
 
 import torch as th
 from torch import nn
@@ -20,6 +20,7 @@ __all__ = [
     "TaskOfRows",
     "adapters",
     "add_adapters",
+    "layers_to_adapt",
     "merge_adapters",
     "renew_adapters",
 ]
@@ -43,11 +44,22 @@ class LoRAConfig:
     """Factor on B A: "released" is 1/r, "paper" is 1."""
     layers: AdaptedLayers = "all"
     """"all": output layers too (the authors' code); "hidden": the input and hidden layers (the paper)."""
+    start: float = 0.75
+    """Share of the run after which the next reset adds adapters instead: 0.75 for MT10, 0.833 for MT50."""
+    min_success: float = 0.8
+    """Mean training success below which networks are reset as before: the authors' 0.8, MT50 0.65; 0 is the paper's."""
+    rescale_critic: bool = True
+    """Whether the frozen critics' values follow c_i, times new over old (the authors' code; not in the paper)."""
 
     def __post_init__(self) -> None:
         check_count("lora option rank", self.rank)
-        if not isinstance(self.per_task, bool):
-            raise ConfigError(f"lora option per_task={self.per_task!r} must be True or False.")
+        for option in ("per_task", "rescale_critic"):
+            if not isinstance(getattr(self, option), bool):
+                raise ConfigError(f"lora option {option}={getattr(self, option)!r} must be True or False.")
+        for option in ("start", "min_success"):
+            value = getattr(self, option)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+                raise ConfigError(f"lora option {option}={value!r} must be between 0 and 1.")
         for option, allowed in (("scale", get_args(Scale)), ("layers", get_args(AdaptedLayers))):
             value = getattr(self, option)
             if value not in allowed:
@@ -55,6 +67,25 @@ class LoRAConfig:
                     f"lora option {option}={value!r} is unknown; choose one of {list(allowed)}."
                     + nearest(str(value), allowed)
                 )
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> LoRAConfig:
+        """Return the checked options.
+
+        :param options: fields by name; those not given have the authors' code's value for MT10
+        :raises ConfigError: for an unknown option, or a value that cannot work
+        """
+        if not isinstance(options, Mapping):
+            raise ConfigError(
+                f"lora={options!r} must be a mapping of options, such as {{'rank': 8}}, or None."
+            )
+        allowed = [field.name for field in fields(cls)]
+        for option in options:
+            if option not in allowed:
+                raise ConfigError(
+                    f"lora has no option {option!r}; it has {allowed}." + nearest(str(option), allowed)
+                )
+        return cls(**options)
 
     @property
     def factor(self) -> float:
@@ -162,25 +193,7 @@ def add_adapters(network: nn.Module, config: LoRAConfig, n_tasks: int) -> TaskOf
 
     Source: the authors' code for what is frozen; the paper does not mention layer norms.
     """
-    if any(isinstance(module, LoRALinear) for module in network.modules()):
-        raise ConfigError("this network has adapters already; renew or merge them instead of adding more.")
-    layers = [
-        (parent, name, layer)
-        for parent in network.modules()
-        for name, layer in parent.named_children()
-        if type(layer) is nn.Linear and not (config.layers == "hidden" and _is_output(parent, layer))
-    ]
-    if not layers:
-        raise ConfigError(
-            "LoRA finds no plain linear layer in this network; use it with the plain MLP policy."
-        )
-    for parent, _, layer in layers:
-        width = layer.in_features if _is_output(parent, layer) else min(layer.in_features, layer.out_features)
-        if config.rank > width:
-            raise ConfigError(
-                f"lora option rank={config.rank} exceeds the width of a layer from {layer.in_features} to "
-                f"{layer.out_features}, which it would not compress; use at most {width}."
-            )
+    layers = layers_to_adapt(network, config)
     for parameter in network.parameters():
         parameter.requires_grad_(False)
     for module in network.modules():
@@ -226,6 +239,35 @@ def merge_adapters(network: nn.Module) -> None:
             merged.weight.add_(layer.delta()[0])
             setattr(parent, name, merged)
     network.requires_grad_(True)
+
+
+def layers_to_adapt(network: nn.Module, config: LoRAConfig) -> list[tuple[nn.Module, str, nn.Linear]]:
+    """Return each layer that :func:`add_adapters` would replace, with its parent and its name there.
+
+    :param network: actor or critics
+    :param config: options
+    :raises ConfigError: see :func:`add_adapters`
+    """
+    if any(isinstance(module, LoRALinear) for module in network.modules()):
+        raise ConfigError("this network has adapters already; renew or merge them instead of adding more.")
+    layers = [
+        (parent, name, layer)
+        for parent in network.modules()
+        for name, layer in parent.named_children()
+        if type(layer) is nn.Linear and not (config.layers == "hidden" and _is_output(parent, layer))
+    ]
+    if not layers:
+        raise ConfigError(
+            "LoRA finds no plain linear layer in this network; use it with the plain MLP policy."
+        )
+    for parent, _, layer in layers:
+        width = layer.in_features if _is_output(parent, layer) else min(layer.in_features, layer.out_features)
+        if config.rank > width:
+            raise ConfigError(
+                f"lora option rank={config.rank} exceeds the width of a layer from {layer.in_features} to "
+                f"{layer.out_features}, which it would not compress; use at most {width}."
+            )
+    return layers
 
 
 def _is_output(parent: nn.Module, layer: nn.Linear) -> bool:

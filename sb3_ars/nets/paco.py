@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_ars.nets.layers import Body, BodyShape, StackedLinear, stacked_product
 
-__all__ = ["PaCo", "mask_out"]
+__all__ = ["PaCo"]
 
 
 class PaCo(Body):
@@ -83,15 +83,3 @@ class PaCo(Body):
         # sum_k w_ik (W_k x + b_k)
         out: th.Tensor = (layer(x) * weights.t().unsqueeze(2)).sum(dim=0)
         return out
-
-
-def mask_out(losses: th.Tensor, healthy: th.Tensor) -> th.Tensor:
-    """Return the losses with those of unhealthy tasks replaced by zero, which stops their gradient.
-
-    :param losses: ``(n_tasks * batch, ...)``, task-major, finite
-    :param healthy: ``(n_tasks,)``, bool
-
-    Source: Sun et al. 2022, section 3.3.
-    """
-    per_task = losses.reshape(healthy.shape[0], -1, *losses.shape[1:])
-    return th.where(healthy.view(-1, *[1] * (per_task.dim() - 1)), per_task, 0.0).flatten(0, 1)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch as th
 from torch import nn
 
-from sb3_ars.nets.layers import TaskLinear
+from sb3_ars.nets.layers import Body, BodyShape, TaskLinear, trunk
 
-__all__ = ["PopArt", "update_statistics"]
+__all__ = ["PopArt", "PopArtNetwork", "PopArtNormalizer", "update_statistics"]
 
 _STD_MIN, _STD_MAX = 1e-4, 1e6
 
@@ -78,9 +78,67 @@ class PopArt(nn.Module):
         return (task * per_task).sum(dim=1, keepdim=True)
 
 
+class PopArtNetwork(Body):
+    """A plain network whose last layer is PopArt's, for critics.
+
+    :param shape: ``hidden`` is the network before the last layer
+    :param update_period: updates from one refresh of mu and sigma to the next
+    :param rate: beta, weight of a batch in the running statistics
+    :param task_in_input: whether the network sees the one-hot besides choosing the output by it
+
+    Source: ARS paper, appendix E.3, which integrates Hessel et al. 2019 into SAC-MT. Deviation: an output row per task,
+    without which outputs could not be preserved; the paper does not say.
+    """
+
+    def __init__(
+        self, shape: BodyShape, update_period: int = 1, rate: float = 3e-4, task_in_input: bool = True
+    ) -> None:
+        super().__init__(task_in_input)
+        in_features, out_features, n_tasks, hidden, activation, layer_norm = shape
+        self.update_period, self.rate = update_period, rate
+        in_features += n_tasks * task_in_input
+        self.trunk = trunk(in_features, hidden, activation, layer_norm)
+        self.popart = PopArt(hidden[-1] if hidden else in_features, n_tasks, out_features)
+
+    def compute(self, x: th.Tensor, task: th.Tensor, task_major: bool) -> th.Tensor:
+        """Return ``(rows, out_features)``, in units of the target; see :meth:`Body.compute`."""
+        out: th.Tensor = self.popart(self.trunk(x), task, task_major)
+        return out
+
+
+class PopArtNormalizer:
+    """The statistics that several PopArt layers share.
+
+    :param networks: critics and target critics
+    """
+
+    def __init__(self, networks: Sequence[PopArtNetwork]) -> None:
+        self._layers = [network.popart for network in networks]
+        self._rate = networks[0].rate
+        self.update_period = networks[0].update_period
+
+    @property
+    def mean(self) -> th.Tensor:
+        """mu, ``(n_tasks,)``, in units of the target."""
+        return self._layers[0].mean
+
+    @property
+    def std(self) -> th.Tensor:
+        """sigma, ``(n_tasks,)``."""
+        return self._layers[0].std
+
+    def update_(self, target: th.Tensor, refresh: bool) -> None:
+        """Track the targets, and every ``update_period``-th time put the statistics to use.
+
+        :param target: ``(n_tasks * batch, m)``, task-major
+        :param refresh: whether this is such a time
+        """
+        update_statistics(self._layers, target, self._rate, refresh)
+
+
 @th.no_grad()
 def update_statistics(
-    layers: Sequence[PopArt], targets: th.Tensor, rate: float, refresh: bool | th.Tensor = True
+    layers: Sequence[PopArt], targets: th.Tensor, rate: float, refresh: bool = True
 ) -> None:
     """Move the running statistics to the targets and, where told to, put them to use with every output preserved.
 
@@ -89,8 +147,7 @@ def update_statistics(
     :param layers: with equal statistics
     :param targets: ``(n_tasks * batch, m)``, task-major
     :param rate: beta, weight of the new batch, in (0, 1]
-    :param refresh: whether mu and sigma follow in this step: every k-th for update period k; a bool, or a scalar float
-        tensor of 1 or 0 where a captured graph has to be told
+    :param refresh: whether mu and sigma follow in this step: every k-th for update period k
 
     Source: van Hasselt et al. 2016, Eq. 4 and 5. Deviation: where statistics are put to use every k-th step, they
     are still tracked at every one. The variance is tracked in place of the second moment: the same numbers without
@@ -103,18 +160,16 @@ def update_statistics(
     distance = batch_mean - first.running_mean
     running_mean = first.running_mean + rate * distance
     running_variance = (1 - rate) * (first.running_variance + rate * distance**2) + rate * batch_variance
-    weight = refresh if isinstance(refresh, th.Tensor) else float(refresh)
-    mean = first.mean.lerp(running_mean, weight)
-    std = first.std.lerp(running_variance.sqrt().clamp(_STD_MIN, _STD_MAX), weight)
-    ratio, shift = first.std / std, (first.mean - mean) / std
+    for layer in layers:
+        layer.running_mean.copy_(running_mean)
+        layer.running_variance.copy_(running_variance)
+    if not refresh:
+        return
+    std = running_variance.sqrt().clamp(_STD_MIN, _STD_MAX)
+    ratio, shift = first.std / std, (first.mean - running_mean) / std
     for layer in layers:
         # W <- (sigma / sigma') W, b <- (sigma b + mu - mu') / sigma', for each task's own rows
         layer.linear.weight.view(layer.n_tasks, -1).mul_(ratio.unsqueeze(1))
         layer.linear.bias.view(layer.n_tasks, -1).mul_(ratio.unsqueeze(1)).add_(shift.unsqueeze(1))
-        for buffer, value in (
-            (layer.mean, mean),
-            (layer.std, std),
-            (layer.running_mean, running_mean),
-            (layer.running_variance, running_variance),
-        ):
-            buffer.copy_(value)
+        layer.mean.copy_(running_mean)
+        layer.std.copy_(std)
