@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from sb3_ars.buffers import TaskReplayBuffer
     from sb3_ars.callbacks.ars import ARSCallback
     from sb3_ars.callbacks.evaluation import TaskEvalCallback
+    from sb3_ars.callbacks.schedule import TaskScheduleCallback
     from sb3_ars.config import ARSConfig
+    from sb3_ars.core.schedule import SMTConfig
     from sb3_ars.envs import make_metaworld_env, make_multitask_env, make_toy_env
     from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, WorkerError
     from sb3_ars.evaluation import evaluate_tasks
@@ -27,7 +29,9 @@ _MODULE_OF = {
     "TaskReplayBuffer": "buffers",
     "ARSCallback": "callbacks.ars",
     "TaskEvalCallback": "callbacks.evaluation",
+    "TaskScheduleCallback": "callbacks.schedule",
     "ARSConfig": "config",
+    "SMTConfig": "core.schedule",
     "make_metaworld_env": "envs",
     "make_multitask_env": "envs",
     "make_toy_env": "envs",
@@ -46,8 +50,10 @@ __all__ = [
     "ConfigError",
     "DivergedError",
     "EnvContractError",
+    "SMTConfig",
     "TaskEvalCallback",
     "TaskReplayBuffer",
+    "TaskScheduleCallback",
     "WorkerError",
     "evaluate_tasks",
     "make_metaworld_env",

@@ -109,7 +109,7 @@ class TaskReplayBuffer(ReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Store one transition of every environment in its task's ring.
+        """Store one transition of every environment in its task's ring, but for tasks that are not active.
 
         On a GPU this is one asynchronous transfer and waits for nothing.
 
@@ -122,26 +122,27 @@ class TaskReplayBuffer(ReplayBuffer):
         :raises EnvContractError: if a value is NaN or infinite, or a terminal observation is missing
         """
         self._allocate()
-        host = self._staging.begin()
+        host, rows = self._staging.begin(), self._rows
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinity, which is refused below
-            host["observations"][:] = np.asarray(obs)[:, : self.obs_dim]
-            host["next_observations"][:] = np.asarray(next_obs)[:, : self.obs_dim]
-            host["actions"][:] = np.asarray(action).reshape(self.n_envs, self.action_dim)
-            host["rewards"][:] = np.asarray(reward).reshape(self.n_envs, 1)
-            host["dones"][:] = np.asarray(done).reshape(self.n_envs, 1)
-        for env in map(int, np.flatnonzero(done)):
-            if infos[env].get("terminal_observation") is None:
+            host["observations"][:] = np.asarray(obs)[rows, : self.obs_dim]
+            host["next_observations"][:] = np.asarray(next_obs)[rows, : self.obs_dim]
+            host["actions"][:] = np.asarray(action).reshape(self.n_envs, self.action_dim)[rows]
+            host["rewards"][:] = np.asarray(reward).reshape(self.n_envs, 1)[rows]
+            host["dones"][:] = np.asarray(done).reshape(self.n_envs, 1)[rows]
+        for row in map(int, np.flatnonzero(np.asarray(done)[rows])):
+            info = infos[self._env_of_row[row]]
+            if info.get("terminal_observation") is None:
                 raise EnvContractError(
-                    f"Task {self._name_of_env(env)!r} ended an episode without infos['terminal_observation']: the next "
+                    f"Task {self._name_of_row(row)!r} ended an episode without infos['terminal_observation']: the next "
                     "episode's first observation would be learned as its outcome. Use an SB3 VecEnv, which sets it."
                 )
-            if self.handle_timeout_termination and infos[env].get("TimeLimit.truncated", False):
-                host["dones"][env] = 0.0
+            if self.handle_timeout_termination and info.get("TimeLimit.truncated", False):
+                host["dones"][row] = 0.0
         self._check_finite(host)
-        slots = (self.task_pos[self.task_of_env] + self._rank_in_task) % self.buffer_size
-        host["slots"][:] = slots + self.task_of_env * self.buffer_size
-        self.task_pos[:] = (self.task_pos + self._envs_of_task) % self.buffer_size
-        self.task_size[:] = np.minimum(self.task_size + self._envs_of_task, self.buffer_size)
+        slots = (self.task_pos[self._task_of_row] + self._rank_in_task) % self.buffer_size
+        host["slots"][:] = slots + self._task_of_row * self.buffer_size
+        self.task_pos[:] = (self.task_pos + self._rows_of_task) % self.buffer_size
+        self.task_size[:] = np.minimum(self.task_size + self._rows_of_task, self.buffer_size)
         self._count_as_sb3()
         host["sizes"][:, 0] = self.task_size
         has_previous = self._frames is not None and self._link_frames(self._frames, host)
@@ -305,6 +306,8 @@ class TaskReplayBuffer(ReplayBuffer):
     def set_task_of_env(self, task_of_env: Sequence[int]) -> None:
         """Accept transitions of another number or order of environments from now on; what is stored stays.
 
+        All tasks are active then.
+
         :param task_of_env: ``(n_envs,)``
         :raises ConfigError: if a task has no environment, or more than its ring has slots
         """
@@ -312,9 +315,27 @@ class TaskReplayBuffer(ReplayBuffer):
         _check_task_of_env(task_of_env, self.n_tasks, self.buffer_size)
         self.n_envs = len(task_of_env)
         self.task_of_env = np.asarray(task_of_env, dtype=np.int64)
-        self._envs_of_task = np.bincount(self.task_of_env, minlength=self.n_tasks)
-        earlier = [task_of_env[:env].count(task) for env, task in enumerate(task_of_env)]
-        self._rank_in_task = np.asarray(earlier, dtype=np.int64)
+        self.set_active_tasks(None)
+
+    def set_active_tasks(self, tasks: Sequence[int] | None) -> None:
+        """Let :meth:`add` store transitions of these tasks alone from now on; what is stored stays.
+
+        :param tasks: indices; None is all
+        :raises ConfigError: if there is none among them, or an unknown one
+        """
+        active = set(range(self.n_tasks) if tasks is None else tasks)
+        if not active or not active <= set(range(self.n_tasks)):
+            raise ConfigError(
+                f"tasks={tasks} must be None or some of the task indices 0 to {self.n_tasks - 1}."
+            )
+        is_active = np.isin(self.task_of_env, list(active))
+        self._env_of_row = np.flatnonzero(is_active)
+        # a slice where it can be: then no step copies its arrays once more
+        self._rows = slice(None) if is_active.all() else self._env_of_row
+        self._task_of_row = self.task_of_env[self._rows]
+        self._rows_of_task = np.bincount(self._task_of_row, minlength=self.n_tasks)
+        of_row = self._task_of_row.tolist()
+        self._rank_in_task = np.array([of_row[:row].count(task) for row, task in enumerate(of_row)], np.int64)
         if self._storage is not None:
             self._staging = self._make_staging()
         if self._frames is not None:
@@ -533,7 +554,7 @@ class TaskReplayBuffer(ReplayBuffer):
             self.__dict__.pop(name, None)
 
     def _make_staging(self) -> _Staging:
-        n, integer, real = self.n_envs, th.int64, th.float32
+        n, integer, real = len(self._env_of_row), th.int64, th.float32
         fields = {"slots": ((n,), integer), "sizes": ((self.n_tasks, 1), integer)}
         if self.optimize_memory_usage:
             fields |= {"previous_slots": ((n,), integer), "frame_rows": ((n,), integer)}
@@ -581,14 +602,14 @@ class TaskReplayBuffer(ReplayBuffer):
         if np.isfinite(host["rows"]).all() and np.isfinite(host["next_observations"]).all():
             return
         for name in _COLUMNS:
-            for env in map(int, np.flatnonzero(~np.isfinite(host[name]).all(axis=1))):
+            for row in map(int, np.flatnonzero(~np.isfinite(host[name]).all(axis=1))):
                 raise EnvContractError(
-                    f"Task {self._name_of_env(env)!r} gave NaN or infinity in {name.replace('_', ' ')}: "
-                    f"{host[name][env]}. It was not stored; what was learned so far is intact."
+                    f"Task {self._name_of_row(row)!r} gave NaN or infinity in {name.replace('_', ' ')}: "
+                    f"{host[name][row]}. It was not stored; what was learned so far is intact."
                 )
 
-    def _name_of_env(self, env: int) -> str:
-        return str(self.task_names[self.task_of_env[env]])
+    def _name_of_row(self, row: int) -> str:
+        return str(self.task_names[self._task_of_row[row]])
 
     def _describe_size(self) -> str:
         return f"{self.n_tasks} tasks x {self.buffer_size:,} transitions, {self.memory_bytes() / 1e9:.2f} GB,"

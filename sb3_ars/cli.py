@@ -22,7 +22,8 @@ __all__ = ["main"]
 
 _USAGE = """sb3-ars: multi-task reinforcement learning with adaptive reward scaling on Stable-Baselines3
 
-  sb3-ars train PRESET [OPTIONS]     train and evaluate; presets: {presets}
+  sb3-ars list [WORD ...]            show the presets, or those with every word in their names
+  sb3-ars train PRESET [OPTIONS]     train and evaluate
   sb3-ars evaluate RUN [OPTIONS]     evaluate a run's policy again
   sb3-ars doctor                     check this machine and its packages
 
@@ -39,12 +40,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands: dict[str, Callable[[list[str]], int]] = {
+        "list": _list,
         "train": _train,
         "evaluate": _evaluate,
         "doctor": _doctor,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_usage())
+        print(_USAGE)
         return 0 if arguments else 2
     name, *rest = arguments
     try:
@@ -59,11 +61,41 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
+def _list(arguments: list[str]) -> int:
+    if any(argument.startswith("-") for argument in arguments):
+        print("sb3-ars list [WORD ...] shows the presets, or those with every word in their names.")
+        return 0 if arguments[0] in ("-h", "--help") else 2
+    from sb3_ars.experiments import find_presets, preset_group, preset_info
+
+    table = Table(box=None, padding=(0, 1, 0, 0))
+    table.add_column("preset", no_wrap=True)
+    table.add_column("what it is")
+    table.add_column("steps", justify="right")
+    table.add_column("table", no_wrap=True)
+    table.add_column("success", no_wrap=True)
+    names = find_presets(arguments)
+    for name, before in zip(names, [None, *names], strict=False):
+        if before is not None and preset_group(before) != preset_group(name):
+            table.add_row()
+        info = preset_info(name)
+        table.add_row(name, info.description, _short(info.total_timesteps), info.table, info.success)
+    # in a pipe there is nothing to wrap lines for, and one line per preset can be searched
+    Console(highlight=False, width=None if sys.stdout.isatty() else 120).print(table)
+    print(
+        "\nsteps: of the environments, all tasks together; table and success: the paper's, in %, over 8 seeds."
+    )
+    return 0
+
+
+def _short(steps: int) -> str:
+    return f"{steps // 10**6}M" if steps >= 10**6 else f"{steps // 1000}k"
+
+
 def _train(arguments: list[str]) -> int:
     from sb3_ars.experiments.config import load_preset
 
     if not arguments or arguments[0].startswith("-"):
-        print(_usage())
+        print(_USAGE)
         return 0 if arguments and arguments[0] in ("-h", "--help") else 2
     name, *rest = arguments
     config = tyro.cli(
@@ -149,12 +181,6 @@ def _print_profile(seconds_by_part: dict[str, float]) -> None:
     for part, seconds in seconds_by_part.items():
         table.add_row(part, PARTS[part], f"{seconds:,.1f}", f"{seconds / total:.1%}")
     Console().print(table)
-
-
-def _usage() -> str:
-    from sb3_ars.experiments import preset_names
-
-    return _USAGE.format(presets=", ".join(preset_names()))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from sb3_ars.core.objectives import ActorValue
 from sb3_ars.core.reward_scale import parse_reward_scaling
@@ -57,7 +57,7 @@ class ARSConfig:
     """Weight of a task's losses: "equal", or n_tasks softmax(-log alpha_i) by "temperature" (Soft Modularization)."""
     max_task_loss: float | None = None
     """Leave a task out of an update when its critic loss exceeds this, and mix its PaCo parameters anew; None never."""
-    lora: dict[str, Any] | None = None
+    lora: dict[str, int | float | bool | str] | None = None
     """Low-rank adapters late in the run: fields of sb3_ars.nets.lora.LoRAConfig, such as {"rank": 8}; None is none."""
 
     def __post_init__(self) -> None:

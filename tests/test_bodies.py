@@ -13,6 +13,8 @@ from sb3_ars.nets.bodies import BODIES, body_config, build_body
 from sb3_ars.nets.layers import StackedLayerNorm, StackedLinear, TaskLinear
 from sb3_ars.nets.mlp import fused_layers_are_available
 from sb3_ars.nets.moore import orthonormal
+from sb3_ars.nets.paco import PaCo
+from sb3_ars.nets.popart import PopArt
 
 N_TASKS, BATCH, IN, OUT = 3, 5, 7, 4
 SMALL = {
@@ -109,6 +111,43 @@ def test_the_task_changes_the_output(name):
     body = enlarged(build(name))
     x, task = flat_rows()
     assert (body(x, task) - body(x, task.roll(1, dims=1))).abs().max() > 1e-3
+
+
+def with_tasks_renumbered(body, order):
+    """A copy in which every parameter of task ``order[i]`` became task i's."""
+    renumbered = copy.deepcopy(body)
+    with th.no_grad():
+        for module in renumbered.modules():
+            if isinstance(module, TaskLinear):  # a block of rows per task
+                for parameter in (module.weight, module.bias):
+                    blocks = parameter.view(N_TASKS, -1)
+                    blocks.copy_(blocks[order].clone())
+            elif isinstance(module, (nn.Linear, StackedLinear)) and module.weight.shape[-1] in (
+                N_TASKS,
+                IN + N_TASKS,
+            ):
+                columns = module.weight[..., -N_TASKS:]  # a column per task
+                columns.copy_(columns[..., order].clone())
+            elif isinstance(module, PaCo):
+                module.task_weights.copy_(module.task_weights[order].clone())
+            elif isinstance(module, PopArt):
+                for buffer in module.buffers(recurse=False):
+                    buffer.copy_(buffer[order].clone())
+    return renumbered
+
+
+@every_body
+def test_renumbering_the_tasks_renumbers_the_outputs(name):
+    body = enlarged(build(name, task_in_input=name != "soft_modules"))
+    for module in body.modules():
+        if isinstance(module, PopArt):
+            module.std.uniform_(1, 2)
+            module.mean.normal_()
+    order = th.tensor([2, 0, 1])
+    x, task = task_major_rows()
+    expected = body(x, task)[order]
+    assert th.allclose(with_tasks_renumbered(body, order)(x[order], task), expected, atol=1e-4)
+    assert not th.allclose(body(x[order], task), expected, atol=1e-3)
 
 
 @every_body

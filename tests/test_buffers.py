@@ -211,6 +211,36 @@ def test_spaces_that_are_no_flat_box_are_refused(space):
         TaskReplayBuffer(10, space, spaces.Box(-1, 1, (2,), np.float32))
 
 
+def test_only_rows_of_active_tasks_are_stored_and_read():
+    buffer = fill(make_buffer(task_of_env=(0, 1, 2, 0)), 1)
+    buffer.set_active_tasks([2, 0])
+    rows = transition(buffer, 1)
+    done = np.array([False, True, False, False])  # without a terminal observation: nobody asks for it
+    buffer.add(*rows[:4], done, [rows[5][0], {}, *rows[5][2:]])
+    assert buffer.task_size.tolist() == [4, 1, 2]
+    assert buffer.rewards[0, :4, 0].tolist() == [0, 300, 1, 301] and buffer.rewards[2, :2, 0].tolist() == [
+        200,
+        201,
+    ]
+    with pytest.raises(EnvContractError, match=r"task2.*terminal_observation"):
+        buffer.add(*rows[:4], ~done, [rows[5][0], {}, {}, rows[5][3]])
+    buffer.set_active_tasks(None)
+    assert fill(buffer, 1).task_size.tolist() == [5, 2, 3]
+
+
+def test_other_envs_make_all_tasks_active_again():
+    buffer = make_buffer()
+    buffer.set_active_tasks([1])
+    buffer.set_task_of_env([0, 1, 1])
+    assert fill(buffer, 1).task_size.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("tasks", [[], [2], [-1], ["task0"]])
+def test_active_tasks_that_are_none_of_the_buffers_are_refused(tasks):
+    with pytest.raises(ConfigError, match="must be None or some of the task indices 0 to 1"):
+        make_buffer().set_active_tasks(tasks)
+
+
 # ---------------------------------------------------------------- one row per transition, ready for a CUDA graph
 
 
@@ -288,11 +318,20 @@ class Twins:
             for optimize in (False, True)
         ]
         self.last = None  # what each env saw last, as a well-behaved loop gives it to the next add
+        self.active = None
         self.rings = [[None] * buffer_size for _ in range(max(task_of_env) + 1)]
         self.pos = [0] * len(self.rings)
 
+    def set_active(self, tasks):
+        self.active = tasks
+        for buffer in self.buffers:
+            buffer.set_active_tasks(tasks)
+
     def step(self, rng, strange):
         plain = self.buffers[0]
+        waits = np.zeros(plain.n_envs, bool)
+        if self.active is not None:
+            waits = ~np.isin(plain.task_of_env, self.active)
         n, one_hot = plain.n_envs, np.eye(plain.n_tasks, dtype=np.float32)[plain.task_of_env]
         # few values, so that frames are often equal by chance, and -0.0, which equals 0.0 with other bits
         frames = rng.choice(np.array([0.0, -0.0, 1.0], np.float32), size=(3, n, OBS_DIM))
@@ -301,12 +340,15 @@ class Twins:
         infos = [
             {"terminal_observation": 1, "TimeLimit.truncated": bool(rng.random() < 0.5)} for _ in range(n)
         ]
+        infos = [{} if wait else info for wait, info in zip(waits, infos, strict=True)]
         reward, action = rng.normal(size=n), rng.uniform(-1, 1, (n, ACTION_DIM))
         for buffer in self.buffers:
             full = [np.hstack((f, one_hot)) for f in (obs, frames[1])]
             buffer.add(*full, action, reward, done, infos)
-        self.last = np.where(done[:, None], frames[2], frames[1])
+        self.last = np.where(waits[:, None], obs, np.where(done[:, None], frames[2], frames[1]))
         for env, task in enumerate(plain.task_of_env):
+            if waits[env]:
+                continue
             dones = float(done[env] and not infos[env]["TimeLimit.truncated"])
             row = np.hstack(
                 (obs[env], one_hot[env], frames[1][env], one_hot[env], action[env], reward[env], dones)
@@ -351,6 +393,7 @@ def through_a_file(buffer):
         seed=5,
     )
     fresh.read_from(file)
+    fresh.set_active_tasks(buffer.task_of_env[buffer._env_of_row])  # a file holds rows, not who collects them
     return fresh
 
 
@@ -363,7 +406,8 @@ ENVS = [[0, 1], [0, 0, 1], [1, 0, 1, 1, 0], [1, 0], [0, 1, 1]]
     capacity=st.integers(3, 11),
     first_envs=st.sampled_from(ENVS),
     operations=st.lists(
-        st.sampled_from(["steps", "strange steps", "reset", "envs", "pickle", "deepcopy", "file"]), max_size=9
+        st.sampled_from(["steps", "strange steps", "reset", "envs", "active", "pickle", "deepcopy", "file"]),
+        max_size=12,
     ),
 )
 def test_storing_each_frame_once_gives_the_same_batches_to_the_bit(seed, capacity, first_envs, operations):
@@ -378,10 +422,13 @@ def test_storing_each_frame_once_gives_the_same_batches_to_the_bit(seed, capacit
             task_of_env = ENVS[rng.integers(len(ENVS))]
             for buffer in twins.buffers:
                 buffer.set_task_of_env(task_of_env)
+            twins.active = None
             if twins.last is not None and (rng.random() < 0.5 or len(task_of_env) != len(twins.last)):
                 twins.last = (
                     None  # the new envs were reset; else their frames go on where the old ones' ended
                 )
+        elif operation == "active":
+            twins.set_active([None, [0], [1], [1, 0]][rng.integers(4)])
         elif operation in ("steps", "strange steps"):
             for _ in range(rng.integers(1, 9)):
                 twins.step(rng, strange=0.3 if operation == "strange steps" else 0.0)
@@ -721,7 +768,9 @@ def test_a_gpu_busy_with_other_work_stores_what_the_cpu_stores(optimize):
         for device in ("cpu", "cuda")
     )
     work = th.rand(4000, 4000, device="cuda")
-    for round_ in range(5):
+    for round_, tasks in enumerate([None, [1], [0], None, [0, 1]]):
+        for buffer in (cpu, cuda):
+            buffer.set_active_tasks(tasks)
         for _ in range(20):  # keeps the stream far behind the host, so that copies are late
             work = work @ work / work.norm()
         random_steps([cpu, cuda], 30, seed=round_)

@@ -265,6 +265,7 @@ def test_calls_out_of_order_raise(n_workers):
         lambda: env.step_async(ZERO),
         lambda: env.get_attr("at"),
         lambda: env.has_attr("at"),
+        lambda: env.set_active_tasks([0]),
     ):
         with pytest.raises(RuntimeError, match="while a step is under way"):
             call()
@@ -275,6 +276,51 @@ def test_calls_out_of_order_raise(n_workers):
     for call in (env.reset, lambda: env.step(ZERO), env.step_wait, lambda: env.get_attr("at")):
         with pytest.raises(RuntimeError, match="closed"):
             call()
+
+
+@pytest.mark.parametrize("n_workers", [0, 2])
+def test_inactive_tasks_stand_still_and_go_on_where_they_stood(n_workers):
+    env = script_env(n_workers)
+    env.reset()
+    env.step(ZERO)
+    env.set_active_tasks([1])
+    for step in (2, 3):
+        observations, rewards, dones, infos = env.step(ZERO)
+        assert observations[:, 0].tolist() == [1, step % 3, 1] and rewards[0] == rewards[2] == 0
+        assert dones.tolist() == [False, step == 3, False] and infos[0] == infos[2] == {}
+    assert "episode" in infos[1]
+    env.set_active_tasks((2, 0))
+    observations, rewards, dones, infos = env.step(ZERO)
+    assert observations[:, 0].tolist() == [2, 0, 2] and rewards.tolist() == [2.5, 0, -1]
+    assert not dones.any() and infos == [{"success": 1.0}, {}, {}]
+    env.set_active_tasks(None)
+    observations, _, dones, infos = env.step(ZERO)
+    assert observations[:, 0].tolist() == [0, 1, 0] and dones.tolist() == [True, False, True]
+    assert [infos[i]["episode"]["l"] for i in (0, 2)] == [3, 3] and infos[0]["episode"]["r"] == 7.5
+    env.close()
+
+
+@pytest.mark.parametrize("n_workers", [0, 2])
+def test_a_reset_starts_episodes_in_inactive_envs_too_and_they_stay_inactive(n_workers):
+    env = script_env(n_workers)
+    env.reset()
+    env.step(ZERO)
+    env.set_active_tasks([0])
+    assert env.reset()[:, 0].tolist() == [0, 0, 0]
+    assert env.step(ZERO)[0][:, 0].tolist() == [1, 0, 0]
+    env.close()
+
+
+@pytest.mark.parametrize("tasks", [[], [3], [-1], ["once"]])
+def test_active_tasks_that_are_none_of_the_envs_are_refused(tasks):
+    with pytest.raises(ConfigError, match="must be None or some of the task indices 0 to 2"):
+        script_env().set_active_tasks(tasks)
+
+
+@pytest.mark.parametrize("kind", ["sb3", "gymnasium"])
+def test_a_ready_made_vector_env_says_which_env_can_leave_tasks_out(kind):
+    with pytest.raises(ConfigError, match=r"VectorEnv|VecEnv always steps all .* MultiTaskVecEnv"):
+        ready_made(kind).set_active_tasks([0])
 
 
 def test_pickling_and_copying_are_refused():

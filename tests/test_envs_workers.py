@@ -70,9 +70,14 @@ class Small(gym.Env):
 
 
 def rollout(env, n_steps):
+    first = env.reset()
+    seen, infos = go_on(env, n_steps)
+    return [first, *seen, env.reset()], infos
+
+
+def go_on(env, n_steps):
     rng = np.random.default_rng(7)
-    seen = [env.reset()]
-    infos = []
+    seen, infos = [], []
     for _ in range(n_steps):
         observations, rewards, dones, step_infos = env.step(
             rng.uniform(-1, 1, (env.num_envs, 2)).astype("f4")
@@ -82,7 +87,6 @@ def rollout(env, n_steps):
             {k: v for k, v in info.items() if k != "episode"} | {"r": info.get("episode", {}).get("r")}
             for info in step_infos
         ]
-    seen.append(env.reset())
     return seen, infos
 
 
@@ -126,6 +130,37 @@ def test_transitions_are_the_same_in_any_number_of_workers(toy_in_process, n_wor
         seed=5, n_envs_per_task=2, max_episode_steps=9, n_workers=n_workers, start_method=start_method
     )
     assert_same(rollout(env, 40), toy_in_process)
+    env.close()
+
+
+def changing_rollout(n_workers):
+    """Transitions of toy tasks of which others are active every 7 steps."""
+    env = make_toy_env(seed=5, n_envs_per_task=2, max_episode_steps=9, n_workers=n_workers)
+    left, right = [], []
+    for tasks in (None, [0], [3], [1, 2], None, [0, 3]):
+        env.set_active_tasks(tasks)
+        seen, infos = rollout(env, 7) if tasks is None else go_on(env, 7)
+        left, right = left + seen, right + infos
+    env.close()
+    return left, right
+
+
+@pytest.mark.parametrize("n_workers", [1, 2, 3])
+def test_transitions_of_active_tasks_are_the_same_in_any_number_of_workers(n_workers):
+    assert_same(changing_rollout(n_workers), changing_rollout(0))
+
+
+def test_a_worker_without_active_tasks_is_not_even_woken():
+    env = build(worker_timeout=0.5)
+    env.reset()
+    pid = env.env_method("pid", indices=0)[0]
+    os.kill(pid, signal.SIGSTOP)
+    env.set_active_tasks([1])
+    first = env.step(np.ones((2, 2)))
+    assert first[1].tolist() == [0.0, 2.0]
+    os.kill(pid, signal.SIGCONT)
+    env.set_active_tasks(None)
+    assert env.step(np.ones((2, 2)))[1].tolist() == [2.0, 2.0]
     env.close()
 
 

@@ -13,9 +13,9 @@ import yaml
 from sb3_ars import ARSSAC
 from sb3_ars.cli import main
 from sb3_ars.errors import ConfigError, WorkerError
-from sb3_ars.experiments import preset_names
-from sb3_ars.experiments.config import RunConfig, load_config, load_preset, save_config
-from sb3_ars.experiments.runner import build_model, protocol_of, train
+from sb3_ars.experiments import runner
+from sb3_ars.experiments.config import RunConfig, ScheduleConfig, load_config, load_preset, save_config
+from sb3_ars.experiments.runner import build_model, train
 
 
 def tiny_toy(**algorithm):
@@ -28,54 +28,6 @@ def tiny_toy(**algorithm):
         ars=dataclasses.replace(preset.ars, param_resets=(400,), updates_after_reset=3),
         policy=dataclasses.replace(preset.policy, net_arch=(8,)),
     )
-
-
-@pytest.mark.parametrize("name", preset_names())
-def test_every_preset_loads_and_survives_being_written(name, tmp_path):
-    config = load_preset(name)
-    save_config(config, tmp_path / "config.yaml")
-    assert load_config(tmp_path / "config.yaml") == config
-
-
-def test_the_presets_that_must_exist_do():
-    assert {
-        "demo",
-        "toy",
-        "mt10-sac",
-        "mt10-ars",
-        "mt10-ars-ln",
-        "mt50-sac",
-        "mt50-ars",
-        "mt50-ars-ln",
-    } <= set(preset_names())
-
-
-def test_paper_presets_have_the_papers_numbers():
-    # paper, Tables 7 and 8
-    for bench, steps, resets, buffer in (
-        ("mt10", 20_000_000, 4, 1_000_000),
-        ("mt50", 100_000_000, 6, 500_000),
-    ):
-        config = load_preset(f"{bench}-ars-ln")
-        algorithm = config.algorithm
-        assert (algorithm.total_timesteps, config.ars.n_reset, algorithm.buffer_size) == (
-            steps,
-            resets,
-            buffer,
-        )
-        assert (algorithm.batch_size, algorithm.learning_rate, algorithm.gamma, algorithm.tau) == (
-            100,
-            3e-4,
-            0.99,
-            0.005,
-        )
-        assert config.policy.net_arch == (400,) * 4 and config.policy.critic_layer_norm
-        assert (config.policy.actor_activation, config.policy.critic_activation) == ("relu", "tanh")
-        assert config.env.tasks == bench.upper() and config.env.max_episode_steps == 500
-        assert protocol_of(config).name == "paper"
-        plain = load_preset(f"{bench}-sac").ars
-        assert (plain.n_reset, plain.reward_scaling, plain.reset) == (0, "none", "none")
-        assert not load_preset(f"{bench}-ars").policy.critic_layer_norm
 
 
 @pytest.mark.parametrize("algorithm", ["ARSSAC", "ARSTQC"])
@@ -152,11 +104,76 @@ def test_a_run_that_never_began_leaves_no_folder(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", preset_names())
-def test_every_preset_has_readable_help(name, capsys):
+# one for each kind of default: None, mappings, numbers by task, a schedule
+KINDS = (
+    "toy",
+    "mt10-ars",
+    "mt10-ars-lora",
+    "mt10-ablation-fixed-100-hard",
+    "mt50-moore-ars",
+    "mt10-popart-10",
+    "mt10-smt",
+)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_presets_have_readable_help(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
     with pytest.raises(SystemExit) as exit_:
         main(["train", name, "--help"])
-    assert exit_.value.code == 0 and "--ars.reward-scaling" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert exit_.value.code == 0 and "subcommands" not in out
+    for option in (
+        "ars.reward-scaling",
+        "ars.lora",
+        "ars.max-task-loss",
+        "schedule.name",
+        "policy.body-options",
+    ):
+        assert f"--{option} " in out, option
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "changes"),
+    [
+        ("mt10-ars", "--ars.max-task-loss 3000", {"ars": {"max_task_loss": 3000.0}}),
+        ("mt10-ars", "--ars.task-weighting temperature", {"ars": {"task_weighting": "temperature"}}),
+        ("mt10-ars", "--ars.lora rank 4 per_task False start 0.5 scale paper", {
+            "ars": {"lora": {"rank": 4, "per_task": False, "start": 0.5, "scale": "paper"}},
+        }),
+        ("mt10-ars-lora", "--ars.lora None", {"ars": {"lora": None}}),
+        ("mt10-ars", "--ars.reward-scaling push-v3 100 reach-v3 2", {
+            "ars": {"reward_scaling": {"push-v3": 100.0, "reach-v3": 2.0}},
+        }),
+        ("mt10-ablation-fixed-100-hard", "--ars.reward-scaling 7", {"ars": {"reward_scaling": 7.0}}),
+        ("mt10-moore", "--policy.body-options n_experts 6 task_in_input False", {
+            "policy": {"body_options": {"n_experts": 6, "task_in_input": False}},
+        }),
+        ("mt10-sac", "--policy.critic-body popart --policy.critic-body-options update_period 7 rate 1e-3", {
+            "policy": {"critic_body": "popart", "critic_body_options": {"update_period": 7, "rate": 0.001}},
+        }),
+        ("mt10-sac", "--schedule.name smt --schedule.pool-size 4 --algorithm.train-freq 2", {
+            "schedule": {"name": "smt", "pool_size": 4}, "algorithm": {"train_freq": 2},
+        }),
+    ],
+)  # fmt: skip
+def test_the_command_line_builds_the_same_configuration_as_a_file(
+    name, arguments, changes, tmp_path, monkeypatch
+):
+    built = []
+    monkeypatch.setattr(runner, "train", lambda config, name: built.append(config) or stop())
+    with pytest.raises(StopIteration):
+        main(["train", name, *arguments.split()])
+    save_config(load_preset(name), tmp_path / "config.yaml")
+    values = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    for part, options in changes.items():
+        values[part] |= options
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
+    assert built == [load_config(tmp_path / "config.yaml")]
+
+
+def stop():
+    raise StopIteration
 
 
 def test_broken_run_folders_are_refused_by_name(tmp_path, capsys):
@@ -205,7 +222,7 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys):
 def test_help_is_instant_readable_and_loads_no_torch():
     script = "import sys; from sb3_ars.cli import main; code = main(['--help']); print(code, 'torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert "sb3-ars train PRESET" in done.stdout and "mt10-ars-ln" in done.stdout
+    assert "sb3-ars train PRESET" in done.stdout and "sb3-ars list" in done.stdout
     assert done.stdout.strip().endswith("0 False")
 
 
@@ -267,3 +284,67 @@ def test_a_configuration_reaches_the_model():
         and model.batch_size == 100
         and model.actor_value == "all"
     )
+
+
+@pytest.mark.parametrize(
+    ("part", "options", "message"),
+    [
+        ("algorithm", {"train_freq": 0}, "algorithm.train_freq=0 must be an integer of at least 1"),
+        ("policy", {"body_options": {"n_experts": 3}}, "policy.body is plain; name one, such as moore"),
+        (
+            "policy",
+            {"critic_body_options": {"rate": 0.1}},
+            "policy.critic_body is same; name one, such as popart",
+        ),
+        ("schedule", {"name": "smt", "pool_size": 0}, "pool_size=0 must be an integer of at least 1"),
+        ("ars", {"lora": {"rnk": 3}}, "lora has no option 'rnk'.*Did you mean 'rank'"),
+    ],
+)
+def test_options_that_cannot_work_are_refused_when_the_configuration_is_read(
+    part, options, message, tmp_path
+):
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({part: options}))
+    with pytest.raises(ConfigError, match=message):
+        load_config(tmp_path / "config.yaml")
+
+
+def test_a_critic_body_gets_its_own_options_and_not_the_actors():
+    from sb3_ars import make_toy_env
+
+    policy = dataclasses.replace(
+        tiny_toy().policy,
+        body="moore",
+        body_options={"n_experts": 2},
+        critic_body="multi_head",
+        critic_body_options={"task_in_input": False},
+    )
+    model = build_model(dataclasses.replace(tiny_toy(), policy=policy), make_toy_env(seed=0))
+    assert model.policy.body == {"name": "moore", "n_experts": 2}
+    assert model.policy.critic_body == {"name": "multi_head", "task_in_input": False}
+
+
+def test_a_scheduled_run_collects_from_the_pool_and_updates_every_train_freq_steps(tmp_path):
+    config = tiny_toy(total_timesteps=2_000, learning_starts=400, train_freq=2)
+    config = dataclasses.replace(
+        config,
+        log_interval=1,
+        schedule=ScheduleConfig(name="smt", pool_size=1, first_stage=1.0, interval=100, window=2),
+        ars=dataclasses.replace(config.ars, param_resets=None, n_reset=0, updates_after_reset=0),
+        output=tmp_path,
+    )
+    result = train(config, "toy", progress_bar=False)
+    summary = json.loads((result.folder / "result.json").read_text())
+    log = pd.read_csv(result.folder / "progress.csv")
+    assert set(log["schedule/n_training"].dropna()) == {1} and summary["timesteps"] == 2_000
+    # one task steps at a time, so 2 environment steps between updates after the random phase
+    assert summary["updates"] == pytest.approx((2_000 - 400) / 2, abs=4)
+    assert load_config(result.folder / "config.yaml").schedule == config.schedule
+
+
+def test_a_schedule_that_cannot_work_is_refused_before_training(tmp_path):
+    config = dataclasses.replace(
+        tiny_toy(), schedule=ScheduleConfig(name="smt", pool_size=4), output=tmp_path
+    )
+    with pytest.raises(ConfigError, match="pool_size=4 holds all 4 tasks"):
+        train(config, "toy", progress_bar=False)
+    assert list(tmp_path.iterdir()) == []

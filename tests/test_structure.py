@@ -1,6 +1,7 @@
 """The package's structure and documents: who imports whom, what is exported, what the README promises."""
 
 import ast
+import fnmatch
 import importlib
 import inspect
 import json
@@ -118,12 +119,37 @@ def test_the_readmes_python_examples_run(code, capsys):
     assert namespace["env"].n_tasks in (2, 4)
 
 
+PAGES = sorted((ROOT.parent / "docs" / "methods").glob("*.md"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_python_examples_of_the_methods_pages_run(page):
+    for block in page.read_text().split("```python\n")[1:]:
+        code = block.split("```")[0]
+        for old, new in (
+            ("make_metaworld_env", "make_toy_env"),
+            ('"MT10", ', ""),
+            ("20_000_000", "400"),
+            ("env,", "env, batch_size=8, updates_after_reset=2,"),
+        ):
+            assert old in code, old
+            code = code.replace(old, new)
+        namespace = {}
+        exec(code, namespace)
+        assert namespace["model"].num_timesteps >= 400 and namespace["model"]._n_updates > 10
+
+
 def test_the_readmes_table_names_real_presets_and_commands():
     from sb3_ars.experiments import preset_names
 
     readme = (ROOT.parent / "README.md").read_text()
+    table = readme.split("| presets | what they train |\n")[1].split("\n\n")[0]
+    patterns = [name for row in table.splitlines()[1:] for name in row.split("|")[1].split("`")[1::2]]
+    assert len(patterns) > 10
+    for pattern in patterns:
+        assert fnmatch.filter(preset_names(), pattern), pattern
     for name in preset_names():
-        assert f"`{name}`" in readme, name
+        assert any(fnmatch.fnmatch(name, pattern) for pattern in patterns), name
     for target in ("make demo", "make test"):
         assert target in readme
 

@@ -544,6 +544,10 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         env.set_active_tasks(indices)
         buffer.set_active_tasks(indices)
         self.active_tasks = indices
+        if (
+            self._stepping_env is not None
+        ):  # SB3 calls on_rollout_start with the rollout's environment in hand
+            self._stepping_env.num_envs = self._n_active_envs()
 
     def _n_active_envs(self) -> int:
         """Return how many environments a vector step steps."""

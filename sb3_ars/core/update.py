@@ -371,7 +371,7 @@ def _task_weight(
     weight = temperature_weight(ent_coef) if hyperparameters.weight_by_temperature else None
     if hyperparameters.max_task_loss is None:
         return weight
-    is_healthy = _per_task(errors, n_tasks) <= hyperparameters.max_task_loss  # NaN is not
+    is_healthy = _per_task(errors, n_tasks) <= hyperparameters.max_task_loss
     return is_healthy.float() if weight is None else weight * is_healthy
 
 

@@ -99,6 +99,13 @@ class TaskIdWrapper(VecEnvWrapper):
             info.update(ours)
         return self._ids.append(observations), np.asarray(rewards, np.float32), np.asarray(dones), infos
 
+    def set_active_tasks(self, tasks: Sequence[int] | None) -> NoReturn:
+        """Refuse: this vector env always steps all of its envs.
+
+        :raises ConfigError: always, saying which env can
+        """
+        _refuse_active_tasks(self.venv)
+
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
@@ -202,6 +209,13 @@ class GymVectorTaskEnv(VecEnv):
             reset_info = _info_of(batch, index)
             self.reset_infos[index] = {k: v for k, v in reset_info.items() if not k.startswith("final_")}
         return self._ids.append(observations), np.asarray(rewards, np.float32), dones, infos
+
+    def set_active_tasks(self, tasks: Sequence[int] | None) -> NoReturn:
+        """Refuse: this vector env always steps all of its envs.
+
+        :raises ConfigError: always, saying which env can
+        """
+        _refuse_active_tasks(self.venv)
 
     def close(self) -> None:
         """Close the vector env; may be called twice."""
@@ -538,6 +552,13 @@ def _is_wrapped(env: gym.Env[Any, Any], wrapper_class: type[Any]) -> bool:
             return True
         env = env.env
     return False
+
+
+def _refuse_active_tasks(venv: Any) -> NoReturn:
+    raise ConfigError(
+        f"A {type(venv).__name__} always steps all of its envs, so tasks cannot be made inactive. Give functions that "
+        "return single envs to make_multitask_env: the MultiTaskVecEnv it then builds can."
+    )
 
 
 def _inner(venv: VectorEnv[Any, Any, Any]) -> Any:

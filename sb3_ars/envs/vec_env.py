@@ -129,6 +129,24 @@ class MultiTaskVecEnv(VecEnv):
             self.reset_infos[end.env] = end.reset_info
         return self._observations(), arrays.rewards.copy(), arrays.terminated | arrays.truncated, infos
 
+    def set_active_tasks(self, tasks: Sequence[int] | None) -> None:
+        """Let only the envs of these tasks step from now on; the others cost nothing.
+
+        They keep their observation, with reward 0, no end of an episode and an empty info, and go on where they stood
+        once they are active again. `reset` starts a new episode in every env all the same.
+
+        :param tasks: task indices; None is all
+        :raises ConfigError: if there is none among them, or an unknown one
+        """
+        self._check_idle("set_active_tasks")
+        active = set(range(self.n_tasks) if tasks is None else tasks)
+        if not active or not active <= set(range(self.n_tasks)):
+            raise ConfigError(
+                f"tasks={tasks} must be None or some of the task indices 0 to {self.n_tasks - 1}."
+            )
+        with self._guarded():
+            self._runner.activate(np.isin(self.task_of_env, list(active)))
+
     def close(self) -> None:
         """Close the envs and end the workers; may be called twice."""
         if self._closed_because is None:

@@ -81,6 +81,7 @@ class StepLayout:
         """Return (name, dtype, shape) of each array, in storage order."""
         n = self.n_envs
         return [
+            ("active", "bool", (n,)),
             ("actions", self.action_dtype, (n, self.action_dim)),
             ("obs", "float32", (n, self.obs_dim)),
             ("terminal_obs", "float32", (n, self.obs_dim)),
@@ -103,8 +104,9 @@ class StepLayout:
 
 
 class StepArrays:
-    """Views into one buffer: what goes into a step (``actions``) and what comes out of it.
+    """Views into one buffer: what goes into a step (``active``, ``actions``) and what comes out of it.
 
+    ``active``: which envs step; the others keep their observation, with reward 0, no end and no success.
     ``obs``: ``(n_envs, obs_dim)``, the observation to act on next, so the new episode's first one after an
     end.
     ``terminal_obs``, ``episode_return`` (float64 sum of raw rewards), ``episode_length``, ``success_once``
@@ -115,6 +117,7 @@ class StepArrays:
     :param buffer: memory of at least ``layout.offsets()[-1]`` bytes; None allocates it in this process
     """
 
+    active: npt.NDArray[np.bool_]
     actions: npt.NDArray[Any]
     obs: npt.NDArray[np.float32]
     terminal_obs: npt.NDArray[np.float32]
@@ -133,6 +136,17 @@ class StepArrays:
             flat = np.frombuffer(memory, dtype, int(np.prod(shape)), offset)
             setattr(self, name, flat.reshape(shape))
 
+    def activate(self, active: npt.NDArray[np.bool_]) -> None:
+        """Let these envs step, and leave nothing of the others' latest step behind.
+
+        :param active: ``(n_envs,)``
+        """
+        self.active[:] = active
+        for column, value in zip(
+            (self.rewards, self.terminated, self.truncated, self.success), _WAITED, strict=True
+        ):
+            column[~active] = value
+
     def rows(self, start: int, stop: int) -> StepArrays:
         """Return the same memory, seen by the envs ``start`` to ``stop - 1`` only."""
         part = object.__new__(StepArrays)
@@ -150,7 +164,10 @@ class EnvRunner(Protocol):
         """Build the envs and return what they are."""
 
     def allocate(self, layout: StepLayout) -> None:
-        """Allocate ``arrays``."""
+        """Allocate ``arrays``; all envs are active."""
+
+    def activate(self, active: npt.NDArray[np.bool_]) -> None:
+        """Let only these envs step from now on, ``(n_envs,)``; the others' episodes go on later where they stood."""
 
     def reset(
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
@@ -158,7 +175,7 @@ class EnvRunner(Protocol):
         """Start a new episode in every env, first observations in ``arrays.obs``; return the infos."""
 
     def step_async(self) -> None:
-        """Begin the step of ``arrays.actions``."""
+        """Begin the step of ``arrays.actions``, in the active envs."""
 
     def step_wait(self) -> list[Ended]:
         """Finish it; the results are in ``arrays``."""
@@ -221,6 +238,11 @@ class TaskEnvs:
     def allocate(self, layout: StepLayout) -> None:
         """Allocate the arrays in this process."""
         self.arrays = StepArrays(layout)
+        self.activate(np.ones(layout.n_envs, bool))
+
+    def activate(self, active: npt.NDArray[np.bool_]) -> None:
+        """Let only these envs step from now on, ``(n_envs,)``."""
+        self.arrays.activate(active)
 
     def attach(self, path: str, layout: StepLayout, start: int, stop: int) -> None:
         """Use rows ``start`` to ``stop - 1`` of the arrays that live in the file at ``path``."""
@@ -246,20 +268,21 @@ class TaskEnvs:
         """Do nothing: in this process a step runs in `step_wait`."""
 
     def step_wait(self) -> list[Ended]:
-        """Step every env with its row of ``arrays.actions``; return the episodes that ended."""
+        """Step every active env with its row of ``arrays.actions``; return the episodes that ended."""
         arrays = self.arrays
         # A copy, because the next step overwrites the rows and an env may keep its last action.
         actions = arrays.actions.copy()
-        outcomes = []  # written at once: an assignment to one element of an array costs as much as to all
+        # written at once: an assignment to one element of an array costs as much as to all
+        outcomes = [_WAITED] * len(self._envs)
         ended: list[Ended] = []
-        for index, env in enumerate(self._envs):
+        for index, env in itertools.compress(enumerate(self._envs), arrays.active.tolist()):
             self.current = index
             obs, reward, terminated, truncated, info = env.step(actions[index])
             reward = float(reward)
             success = self._note_success(index, info)
             self._returns[index] += reward
             self._lengths[index] += 1
-            outcomes.append((reward, terminated, truncated, success))
+            outcomes[index] = (reward, terminated, truncated, success)
             if terminated or truncated:
                 ended.append(Ended(index, dict(info), self._end_episode(index, obs)))
             else:
@@ -397,6 +420,7 @@ class WorkerPool:
         bounds = [len(tasks) * worker // n_workers for worker in range(n_workers + 1)]
         self._chunks = [range(start, stop) for start, stop in itertools.pairwise(bounds)]
         self._worker_of = [worker for worker, chunk in enumerate(self._chunks) for _ in chunk]
+        self._stepping: list[int] = []
         self._awaiting: set[int] = set()
         self._replies: dict[int, bytes] = {}
         self._processes: list[BaseProcess] = []
@@ -429,9 +453,16 @@ class WorkerPool:
         with tempfile.NamedTemporaryFile(prefix="sb3_ars_", dir=folder) as file:
             file.truncate(layout.offsets()[-1])
             self.arrays = StepArrays(layout, mmap.mmap(file.fileno(), layout.offsets()[-1]))
+            self.activate(np.ones(layout.n_envs, bool))
             self._command(
                 [("attach", (file.name, layout, c.start, c.stop)) for c in self._chunks], "attaching memory"
             )
+
+    def activate(self, active: npt.NDArray[np.bool_]) -> None:
+        """Let only these envs step from now on, ``(n_envs,)``; a worker without any of them is not woken."""
+        self._settle()
+        self.arrays.activate(active)
+        self._stepping = [worker for worker, c in enumerate(self._chunks) if active[c.start : c.stop].any()]
 
     def reset(
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
@@ -443,10 +474,10 @@ class WorkerPool:
         return self._take_lists()
 
     def step_async(self) -> None:
-        """Begin the step of ``arrays.actions``."""
+        """Begin the step of ``arrays.actions``, in the active envs."""
         self._settle()
-        for worker, line in enumerate(self._lines):
-            line.ask(_STEP)
+        for worker in self._stepping:
+            self._lines[worker].ask(_STEP)
             self._awaiting.add(worker)
 
     def step_wait(self) -> list[Ended]:
@@ -634,6 +665,13 @@ class TimeLimited:
         """Return a new env."""
         return gym.wrappers.TimeLimit(self.factory(), self.max_episode_steps)
 
+
+_WAITED = (
+    0.0,
+    False,
+    False,
+    math.nan,
+)  # reward, terminated, truncated and success of an env that did not step
 
 _STEP, _COMMAND, _CLOSE = 1, 2, 3  # what is asked
 _DONE, _REPLY = 1, 2  # what is answered: nothing to add, or something in the pipe

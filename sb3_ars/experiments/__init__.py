@@ -1,13 +1,12 @@
 """Runs as data: presets, the runner, figures."""
 
-from importlib import resources
+from sb3_ars.experiments.catalogue import (
+    PRESETS,
+    PresetInfo,
+    find_presets,
+    preset_group,
+    preset_info,
+    preset_names,
+)
 
-PRESETS = resources.files(__name__) / "presets"
-"""Folder of the presets that ship with the package, one YAML file each."""
-
-
-def preset_names() -> list[str]:
-    """Return the names of the presets."""
-    return sorted(
-        path.name.removesuffix(".yaml") for path in PRESETS.iterdir() if path.name.endswith(".yaml")
-    )
+__all__ = ["PRESETS", "PresetInfo", "find_presets", "preset_group", "preset_info", "preset_names"]

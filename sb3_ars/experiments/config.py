@@ -11,8 +11,9 @@ from typing import Any, Literal, TypeVar, get_type_hints
 import yaml
 
 from sb3_ars.config import ARSConfig, Execution, Precision
+from sb3_ars.core.schedule import SMTConfig
 from sb3_ars.errors import ConfigError, check_count, nearest
-from sb3_ars.experiments import PRESETS, preset_names
+from sb3_ars.experiments.catalogue import preset_values
 
 __all__ = [
     "AlgorithmConfig",
@@ -20,6 +21,7 @@ __all__ = [
     "EvaluationConfig",
     "PolicyConfig",
     "RunConfig",
+    "ScheduleConfig",
     "load_config",
     "load_preset",
     "save_config",
@@ -27,6 +29,8 @@ __all__ = [
 
 Activation = Literal["relu", "tanh"]
 Body = Literal["plain", "multi_head", "soft_modules", "moore", "paco"]
+CriticBody = Literal["same", "plain", "multi_head", "soft_modules", "moore", "paco", "popart"]
+BodyOptions = dict[str, int | float | bool]
 Config = TypeVar("Config")
 
 
@@ -62,8 +66,10 @@ class AlgorithmConfig:
     """Rows per task in each update."""
     learning_starts: int | Literal["auto"] = "auto"
     """Environment steps before the first update; auto is 1.25 % of the run and at least one batch per task."""
+    train_freq: int = 1
+    """Joint steps of all environments between updates."""
     gradient_steps: int = 1
-    """Updates after each joint step of all environments."""
+    """Updates after every train_freq joint steps."""
     gamma: float = 0.99
     """Discount."""
     tau: float = 0.005
@@ -80,6 +86,9 @@ class AlgorithmConfig:
     """How updates run: eager, fused (CPU), compile or cudagraph; auto is the fastest for the device."""
     overlap: bool | None = None
     """Update while the environments step; None is yes on CUDA, no on CPU."""
+
+    def __post_init__(self) -> None:
+        check_count("algorithm.train_freq", self.train_freq)  # with 0, SB3 would collect nothing for ever
 
 
 @dataclass(frozen=True)
@@ -100,10 +109,32 @@ class PolicyConfig:
     """Initial weights."""
     body: Body = "plain"
     """Network of the actor: plain, or one that treats tasks differently."""
-    critic_body: Literal["same", Body] = "same"
-    """Network of the critics; same is the actor's."""
-    body_options: dict[str, int] = field(default_factory=dict)
-    """Options of the body, such as n_experts; those not given have the paper's value for MT10."""
+    body_options: BodyOptions | None = None
+    """Options of the body by name, such as n_experts 6; those not given have the paper's value for MT10."""
+    critic_body: CriticBody = "same"
+    """Network of the critics; same is the actor's, options included."""
+    critic_body_options: BodyOptions | None = None
+    """Options of a critic_body of its own, such as update_period 10 of popart."""
+
+    def __post_init__(self) -> None:
+        if self.body_options and self.body == "plain":
+            raise ConfigError(
+                f"policy.body_options={self.body_options} go with a body, but policy.body is plain; name one, such as "
+                "moore, or drop them."
+            )
+        if self.critic_body_options and self.critic_body in ("same", "plain"):
+            raise ConfigError(
+                f"policy.critic_body_options={self.critic_body_options} go with a body of the critics' own, but "
+                f"policy.critic_body is {self.critic_body}; name one, such as popart, or drop them."
+            )
+
+
+@dataclass(frozen=True)
+class ScheduleConfig(SMTConfig):
+    """Which tasks collect data, and when."""
+
+    name: Literal["none", "smt"] = "none"
+    """none: all tasks, always; smt: hard tasks first, with the options here."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +173,7 @@ class RunConfig:
     algorithm: AlgorithmConfig = field(default_factory=AlgorithmConfig)
     ars: ARSConfig = field(default_factory=ARSConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
@@ -151,7 +183,7 @@ def load_preset(name: str) -> RunConfig:
     :param name: one of :func:`~sb3_ars.experiments.preset_names`
     :raises ConfigError: if there is none of that name, or its file holds an unknown key
     """
-    return _build(RunConfig, _preset_values(name), f"preset {name!r}")
+    return _build(RunConfig, preset_values(name), f"preset {name!r}")
 
 
 def load_config(path: Path) -> RunConfig:
@@ -178,24 +210,6 @@ def save_config(config: RunConfig, path: Path) -> None:
     :param path: file to write
     """
     path.write_text(yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False), encoding="utf-8")
-
-
-def _preset_values(name: str) -> dict[str, Any]:
-    names = preset_names()
-    if name not in names:
-        raise ConfigError(
-            f"There is no preset {name!r}; there are {', '.join(names)}." + nearest(name, names)
-        )
-    values: dict[str, Any] = yaml.safe_load((PRESETS / f"{name}.yaml").read_text(encoding="utf-8"))
-    base = values.pop("extends", None)
-    return values if base is None else _merged(_preset_values(base), values)
-
-
-def _merged(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in changes.items():
-        merged[key] = _merged(base[key], value) if isinstance(base.get(key), dict) else value
-    return merged
 
 
 def _build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:

@@ -22,6 +22,7 @@ from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.algorithms.sac import ARSSAC
 from sb3_ars.algorithms.tqc import ARSTQC
 from sb3_ars.callbacks.evaluation import TaskEvalCallback
+from sb3_ars.callbacks.schedule import TaskScheduleCallback
 from sb3_ars.envs import make_metaworld_env, make_toy_env
 from sb3_ars.errors import ConfigError
 from sb3_ars.evaluation import (
@@ -31,12 +32,20 @@ from sb3_ars.evaluation import (
     get_protocol,
     make_evaluation_env,
 )
-from sb3_ars.experiments.config import Activation, RunConfig, load_config, save_config
+from sb3_ars.experiments.config import Activation, BodyOptions, RunConfig, load_config, save_config
 from sb3_ars.experiments.plots import plot_training
 from sb3_ars.profiling import PartTimer
 from sb3_ars.versions import run_versions
 
-__all__ = ["RunResult", "build_model", "evaluate_run", "final_table", "make_env", "train"]
+__all__ = [
+    "RunResult",
+    "build_model",
+    "evaluate_run",
+    "final_table",
+    "make_env",
+    "method_callbacks",
+    "train",
+]
 
 _ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 _ALGORITHMS: dict[str, type[MultiTaskOffPolicyAlgorithm]] = {"ARSSAC": ARSSAC, "ARSTQC": ARSTQC}
@@ -175,7 +184,7 @@ def build_model(config: RunConfig, env: VecEnv, verbose: int = 0) -> MultiTaskOf
             "body": _body(policy.body, policy.body_options),
             "critic_body": "same"
             if policy.critic_body == "same"
-            else _body(policy.critic_body, policy.body_options),
+            else _body(policy.critic_body, policy.critic_body_options),
         },
         seed=config.seed,
         verbose=verbose,
@@ -184,8 +193,16 @@ def build_model(config: RunConfig, env: VecEnv, verbose: int = 0) -> MultiTaskOf
     )
 
 
-def _body(name: str, options: dict[str, int]) -> dict[str, Any] | None:
-    return None if name == "plain" else {"name": name, **options}
+def method_callbacks(config: RunConfig) -> list[BaseCallback]:
+    """Return the callbacks that are part of a configuration's method.
+
+    :param config: of the run
+    """
+    return [TaskScheduleCallback(config.schedule)] if config.schedule.name == "smt" else []
+
+
+def _body(name: str, options: BodyOptions | None) -> dict[str, Any] | None:
+    return None if name == "plain" else {"name": name, **(options or {})}
 
 
 def protocol_of(config: RunConfig, own_horizon: bool = True) -> EvaluationProtocol:
@@ -225,7 +242,7 @@ def _learn(
 ) -> bool:
     """Train; return whether the user interrupted."""
     bar = ProgressBarCallback()
-    callbacks: list[BaseCallback] = [bar] if progress_bar else []
+    callbacks = [*([bar] if progress_bar else []), *method_callbacks(config)]
     if config.evaluation.every is not None:
         callbacks.append(
             TaskEvalCallback(
