@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 BENCH_READY := $(VENV)/.bench_ready
 
-.PHONY: demo test test-slow check format bench clean
+.PHONY: demo test test-slow check format bench bench-methods bench-toy clean
 
 demo: $(READY)
 	$(BIN)/sb3-ars train demo
@@ -28,6 +28,13 @@ format: $(READY)
 
 bench: $(BENCH_READY)
 	$(BIN)/python -m benchmarks.run_all
+
+bench-methods: $(READY)
+	$(BIN)/python -m benchmarks.run_all --only methods
+
+bench-toy: $(READY)
+	$(BIN)/python -m benchmarks.toy_methods
+	$(BIN)/python -m benchmarks.report
 
 $(READY): setup.cfg pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): a few minutes, and about 1 GB of downloads the first time."

@@ -305,7 +305,7 @@ def cpu_model() -> str:
 
 
 def write_result(name: str, result: dict[str, Any], folder: Path = RESULTS) -> Path:
-    """Write ``<folder>/<name>.json`` and return its path; floats keep five significant digits.
+    """Write ``<folder>/<name>.json``, whole or not at all, and return its path; floats keep five significant digits.
 
     :param name: of the benchmark
     :param result: plain values
@@ -313,7 +313,9 @@ def write_result(name: str, result: dict[str, Any], folder: Path = RESULTS) -> P
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
-    path.write_text(json.dumps(_rounded(result), indent=2) + "\n", encoding="utf-8")
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(json.dumps(_rounded(result), indent=2) + "\n", encoding="utf-8")
+    unfinished.replace(path)
     return path
 
 
@@ -349,7 +351,7 @@ def _cpu_flags() -> list[str]:
 
 def _tree_is_dirty() -> bool | None:
     """Return whether files differ from the commit, those that benchmarks write left out; ``None`` without git."""
-    paths = [".", ":!benchmarks/results", ":!docs/performance.md"]
+    paths = [".", ":!benchmarks/results", ":!docs/performance.md", ":!docs/methods.md", ":!docs/methods"]
     try:
         done = subprocess.run(
             ["git", "status", "--porcelain", "--", *paths],

@@ -1,24 +1,28 @@
-"""Writes what the documents say of speed and memory, from the benchmarks' JSON files alone; measures nothing.
+"""Writes what the documents say of speed, memory and success, from the benchmarks' JSON files; measures nothing.
 
     python -m benchmarks.report
 
 Tables stand in the pages between ``<!-- begin: NAME -->`` and ``<!-- end: NAME -->``; a test compares them with the
-files.
+files. A method's page has ``toy-PAGE``, its success on the toy tasks, and ``cost-PAGE``, its updates' time and memory.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import memory
+from benchmarks import memory, methods
 from benchmarks.harness import RESULTS, ROOT, markdown_table
+from benchmarks.toy_methods import ARMS, summary
 
-PAGES = (ROOT / "docs" / "performance.md",)
+PERFORMANCE, METHODS_PAGE = ROOT / "docs" / "performance.md", ROOT / "docs" / "methods.md"
+METHOD_PAGES = METHODS_PAGE.with_suffix("")  # a folder
+PAGES = (PERFORMANCE, METHODS_PAGE, *sorted(METHOD_PAGES.glob("*.md")))
 CHART = "performance.png"
 UNMEASURED = "Not measured yet."
 _BLOCK = re.compile(r"(<!-- begin: (?P<name>[\w-]+) -->\n).*?(<!-- end: (?P=name) -->)", re.DOTALL)
@@ -45,6 +49,49 @@ class Panel:
     ratio: str
     rows: tuple[Row, ...]
 
+
+@dataclass(frozen=True)
+class Method:
+    """One line of the table of methods; ``None`` where there is nothing to measure.
+
+    :param label: in tables
+    :param page: in docs/methods, without ``.md``
+    :param alone: arm of the toy tasks without ARS
+    :param with_ars: arm with it
+    :param cost: name in ``methods.json``
+    """
+
+    label: str
+    page: str
+    alone: str | None
+    with_ars: str | None
+    cost: str | None
+
+
+METHODS = (
+    Method("SAC-MT", "sac-mt", "sac", None, "sac"),
+    Method("ARS", "ars", None, "ars", "sac"),
+    Method("ARS in bfloat16", "ars", None, "ars-bf16", None),
+    Method("ARS-LN", "ars", None, "ars-ln", "ars-ln"),
+    Method("ARS-LoRA, adapters per task", "lora", None, "ars-lora", "ars-lora"),
+    Method("ARS-LoRA, shared adapters", "lora", None, "ars-lora-paper", "ars-lora-paper"),
+    Method("SAC-MT-MH", "multi-head", "mh", "mh-ars", "mh"),
+    Method("Soft Modularization", "soft-modules", "soft-modules", "soft-modules-ars", "soft-modules"),
+    Method("Soft Modularization, 2 x 2 x 256", "soft-modules", None, None, "soft-modules-2x2"),
+    Method(
+        "Soft Modularization, reweighted",
+        "soft-modules",
+        "soft-modules-reweighted",
+        "soft-modules-reweighted-ars",
+        None,
+    ),
+    Method("PCGrad", "pcgrad", "pcgrad", "pcgrad-ars", "pcgrad"),
+    Method("PaCo", "paco", "paco", "paco-ars", "paco"),
+    Method("MOORE", "moore", "moore", "moore-ars", "moore"),
+    Method("PopArt", "popart", "popart", None, "popart-10"),
+    Method("SMT", "smt", "smt", None, "sac"),
+    Method("TQC", "tqc", "tqc", "tqc-ars", "tqc"),
+)
 
 Results = dict[str, Any]
 
@@ -159,13 +206,21 @@ PANELS: dict[str, Callable[[dict[str, Any]], list[Panel]]] = {
 def render(name: str, results: Results) -> str:
     """Return the text of a block.
 
-    :param name: "machine", "goals", "chart", or a benchmark's
+    :param name: of ``BLOCKS``, of ``METHOD_BLOCKS``, a benchmark's, or "toy-" or "cost-" and a method's page
     :param results: name of a benchmark -> its JSON file
     """
-    if name in BLOCKS:
-        return BLOCKS[name](results)
+    blocks = BLOCKS | METHOD_BLOCKS
+    if name in blocks:
+        return blocks[name](results)
+    kind, _, page = name.partition("-")
+    pages = dict.fromkeys(method.page for method in METHODS)
+    if kind in PAGE_BLOCKS and page in pages:
+        return PAGE_BLOCKS[kind](results, page)
     if name not in PANELS:
-        raise KeyError(f"no block {name!r}; there are {', '.join([*BLOCKS, *PANELS])}")
+        names = [*blocks, *PANELS, *(f"{kind}-PAGE" for kind in PAGE_BLOCKS)]
+        raise KeyError(
+            f"no block {name!r}; there are {', '.join(names)}, with PAGE one of {', '.join(pages)}"
+        )
     return tables(name, results[name]) if name in results else UNMEASURED
 
 
@@ -218,13 +273,15 @@ def _spread(row: Row) -> str:
     return f"{row.low:.2f} to {row.high:.2f}" if row.low != row.high else "-"
 
 
-def _goals_block(results: Results) -> str:
-    found = [entry for name in (*PANELS, "gpu_mt10") for entry in results.get(name, {}).get("goals", [])]
-    return goals_table(found) if found else UNMEASURED
+def goals_table(results: Results, names: Iterable[str]) -> str:
+    """Return every goal of some benchmarks, what was measured, and whether it was reached.
 
-
-def goals_table(found: list[dict[str, Any]]) -> str:
-    """Return every goal, what was measured, and whether it was reached."""
+    :param results: name of a benchmark -> its JSON file
+    :param names: of the benchmarks
+    """
+    found = [entry for name in names for entry in results.get(name, {}).get("goals", [])]
+    if not found:
+        return UNMEASURED
     rows = [
         (
             entry["goal"],
@@ -237,15 +294,16 @@ def goals_table(found: list[dict[str, Any]]) -> str:
     return markdown_table(("goal", "wanted", "measured", ""), rows)
 
 
-def _machine_block(results: Results) -> str:
+def _machine_block(results: Results, names: Iterable[str]) -> str:
     """Name machine, versions and commit of each file; where they agree, once."""
-    names: dict[str, list[str]] = {}
-    for name, result in results.items():
-        if "machine" in result:
-            names.setdefault(_machine_line(result["machine"]), []).append(f"`{name}.json`")
-    if not names:
+    files: dict[str, list[str]] = {}
+    for name in (name for name in names if name in results):
+        for machine in results[name].get("machines", [results[name].get("machine")]):
+            if machine is not None:
+                files.setdefault(_machine_line(machine), []).append(f"`{name}.json`")
+    if not files:
         return UNMEASURED
-    return "\n".join(f"- {', '.join(files)}: {line}" for line, files in names.items())
+    return "\n".join(f"- {', '.join(named)}: {line}" for line, named in files.items())
 
 
 def _machine_line(machine: dict[str, Any]) -> str:
@@ -278,22 +336,139 @@ def _gpu_block(results: Results) -> str:
     return markdown_table((f"preset {result['preset']}", ""), rows)
 
 
+# ---------------------------------------------------------------------- the methods
+
+
+def _methods_block(results: Results) -> str:
+    """Return one line per method: success on the toy tasks, time and memory of an update."""
+    headings = (
+        "method",
+        "toy tasks, without ARS",
+        "with ARS",
+        *(f"update, {n} tasks: {what}" for n in (10, 50) for what in ("time", "memory")),
+    )
+    rows = [
+        (
+            f"[{method.label}]({METHOD_PAGES.name}/{method.page}.md)",
+            *(_success(results, arm) for arm in (method.alone, method.with_ars)),
+            *_times_baseline(results, method.cost),
+        )
+        for method in METHODS
+    ]
+    return markdown_table(headings, rows)
+
+
+def _success(results: Results, arm: str | None) -> str:
+    """Return an arm's mean success, and in brackets its lowest task's; see :func:`~benchmarks.toy_methods.summary`."""
+    if arm is None:
+        return "-"
+    runs = results.get("toy_methods", {}).get("runs", {})
+    if arm not in runs:
+        return "?"
+    found = summary(runs[arm])
+    return f"{found['mean']:.2f} ({found['lowest_task']:.2f})"
+
+
+def _times_baseline(results: Results, cost: str | None) -> list[str]:
+    """Return time and memory at 10 and at 50 tasks as multiples of SAC-MT's."""
+    measured = results.get("methods", {}).get("methods", {})
+    if cost is None or cost not in measured:
+        return ["-" if cost is None else "?"] * 4
+    cases = methods.shown_cases(measured[cost]["cases"]).values()
+    return [f"{row[key]:.2f}" for row in cases for key in ("times", "times_baseline_bytes")]
+
+
+def _toy_block(results: Results, page: str) -> str:
+    """Return the success of a page's arms, below that of SAC-MT and ARS."""
+    runs = results.get("toy_methods", {}).get("runs", {})
+    arms: dict[str | None, str] = {"sac": "SAC-MT", "ars": "ARS"}
+    for method in (method for method in METHODS if method.page == page):
+        joined = method.label if method.alone is None else f"ARS + {method.label}"
+        arms = {method.alone: method.label, method.with_ars: joined} | arms
+    rows = []
+    for arm in (arm for arm in ARMS if arm in arms and arm in runs):
+        found = summary(runs[arm])
+        numbers = (*found["tasks"], found["mean"], found["lowest"])
+        rest = (f"{found['seconds']:.0f}", f"{found['seeds']}")
+        rows.append((arms[arm], *(f"{number:.2f}" for number in numbers), *rest))
+    scales = results["toy_methods"]["reward_scales"] if rows else ()
+    tasks = (f"rewards to {scale:g}" for scale in scales)
+    headings = (
+        "success on the toy tasks",
+        *tasks,
+        "mean",
+        "lowest of any task and seed",
+        "seconds a run",
+        "seeds",
+    )
+    return markdown_table(headings, rows) if rows else UNMEASURED
+
+
+def _cost_block(results: Results, page: str) -> str:
+    """Return time and memory of a page's methods."""
+    measured = results.get("methods", {}).get("methods", {})
+    costs = (method.cost for method in METHODS if method.page == page and method.cost is not None)
+    names = dict.fromkeys(name for name in costs if name in measured)
+    rows = []
+    for name in names:
+        for case, row in measured[name]["cases"].items():
+            _, n_tasks = methods.CASES[case]
+            network = "MT50's network" if case == "mt50" else "MT10's network"
+            if "mt50" not in measured[name]["cases"]:
+                network = "same network"
+            rows.append(
+                (
+                    f"{methods.LABELS[name]}, {n_tasks} tasks, {network}",
+                    f"{row['median_seconds'] * 1000:.0f} ms",
+                    f"{row['times']:.2f}",
+                    f"{row['times_low']:.2f} to {row['times_high']:.2f}",
+                    f"{row['peak_bytes'] / 1e6:.0f} MB",
+                    f"{row['times_baseline_bytes']:.2f}",
+                    f"{row['learned_parameters']:,}",
+                )
+            )
+    headings = (
+        "one update",
+        "time",
+        "times SAC-MT's",
+        "quartiles over rounds",
+        "memory",
+        "times SAC-MT's",
+        "parameters that learn",
+    )
+    return markdown_table(headings, rows) if rows else UNMEASURED
+
+
+SPEED = (*PANELS, "gpu_mt10")
+COMPARED = ("toy_methods", "methods")
+
 BLOCKS: dict[str, Callable[[Results], str]] = {
-    "machine": _machine_block,
-    "goals": _goals_block,
+    "machine": partial(_machine_block, names=SPEED),
+    "goals": partial(goals_table, names=SPEED),
     "gpu_mt10": _gpu_block,
 }
+"""Of the page on performance, beside ``PANELS``."""
+
+METHOD_BLOCKS: dict[str, Callable[[Results], str]] = {
+    "methods": _methods_block,
+    "methods-goals": partial(goals_table, names=COMPARED),
+    "methods-machine": partial(_machine_block, names=COMPARED),
+}
+"""Of the page that compares the methods."""
+
+PAGE_BLOCKS: dict[str, Callable[[Results, str], str]] = {"toy": _toy_block, "cost": _cost_block}
+"""Of the methods' own pages."""
 
 
 # ---------------------------------------------------------------------- pages and picture
 
 
 def read_results(folder: Path = RESULTS) -> Results:
-    """Return the JSON files of the benchmarks this page is about.
+    """Return the JSON files of the benchmarks the pages are about.
 
     :param folder: where they are
     """
-    paths = {name: folder / f"{name}.json" for name in (*PANELS, "gpu_mt10")}
+    paths = {name: folder / f"{name}.json" for name in (*SPEED, *COMPARED)}
     return {
         name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.is_file()
     }
@@ -374,11 +549,20 @@ def write_pages(folder: Path = RESULTS) -> list[Path]:
         if (new := filled(page, results)) != page:
             path.write_text(new, encoding="utf-8")
             written.append(path)
+    return written + draw_chart(results, folder)
+
+
+def draw_chart(results: Results, folder: Path) -> list[Path]:
+    """Draw the chart of all panels there are, and return its path; of none, draw none.
+
+    :param results: of :func:`read_results`
+    :param folder: for the picture
+    """
     panels = [panel for group in panels_of(results).values() for panel in group]
-    if panels:
-        draw(panels, folder / CHART)
-        written.append(folder / CHART)
-    return written
+    if not panels:
+        return []
+    draw(panels, folder / CHART)
+    return [folder / CHART]
 
 
 if __name__ == "__main__":

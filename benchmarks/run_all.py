@@ -1,6 +1,7 @@
 """Runs the CPU benchmarks one after another, writes their JSON, the chart and the documents' tables, prints the goals.
 
-python -m benchmarks.run_all            # what ``make bench`` runs; under 15 minutes on two cores
+python -m benchmarks.run_all                    # what ``make bench`` runs; under 15 minutes on two cores
+python -m benchmarks.run_all --only methods     # ``make bench-methods``; about as long
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks import env_steps, memory, report, training_loop, update
+from benchmarks import env_steps, memory, methods, report, training_loop, update
 from benchmarks.harness import RESULTS, write_result
 
 BENCHMARKS: dict[str, Callable[[], dict[str, Any]]] = {
@@ -21,30 +22,30 @@ BENCHMARKS: dict[str, Callable[[], dict[str, Any]]] = {
     "update": update.measure,
     "training_loop": training_loop.measure,
     "memory": memory.measure,
+    "methods": methods.measure,
 }
+USUAL = tuple(report.PANELS)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", nargs="+", choices=BENCHMARKS, default=list(BENCHMARKS), help="these alone")
+    parser.add_argument("--only", nargs="+", choices=BENCHMARKS, default=USUAL, help="these alone")
     parser.add_argument(
         "--output", type=Path, default=RESULTS, help="another folder leaves the documents as they are"
     )
     arguments = parser.parse_args()
     failed = [name for name in arguments.only if not _ran(name, arguments.output)]
-    results = {name: r for name, r in report.read_results(arguments.output).items() if name in BENCHMARKS}
-    for name, result in results.items():
-        print("", report.tables(name, result), sep="\n")
-    print("", report.render("goals", results), sep="\n")
+    results = report.read_results(arguments.output)
+    measured = {name: results[name] for name in arguments.only if name in results}
+    for name in measured:
+        print("", report.render(name, results), sep="\n")
+    print("", report.goals_table(measured, measured), sep="\n")
     if arguments.output == RESULTS:
         print("", "written:", *report.write_pages(), sep="\n")
     else:
-        report.draw(
-            [p for group in report.panels_of(results).values() for p in group],
-            arguments.output / report.CHART,
-        )
+        report.draw_chart(measured, arguments.output)
     if failed:
         print("failed:", *failed, file=sys.stderr)
     return 1 if failed else 0

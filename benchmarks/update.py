@@ -82,7 +82,7 @@ def make_ours(
         device="cpu",
         **options,
     )
-    _prepare(model, n_tasks, stored)
+    prepare(model, n_tasks, stored)
     model.update_reward_scale()
     return stopwatch(lambda: model.train(gradient_steps=1, batch_size=batch_size))
 
@@ -103,7 +103,7 @@ def make_sb3(
         seed=0,
         device="cpu",
     )
-    _prepare(model, n_tasks, stored)
+    prepare(model, n_tasks, stored)
     return stopwatch(lambda: model.train(gradient_steps=1, batch_size=batch_size * n_tasks))
 
 
@@ -119,7 +119,7 @@ def make_sbx(
     model = SAC(
         "MlpPolicy", _plain_env(n_tasks), buffer_size=stored * n_tasks, policy_kwargs=policy_kwargs, seed=0
     )
-    _prepare(model, n_tasks, stored)
+    prepare(model, n_tasks, stored)
 
     def update() -> None:
         model.train(gradient_steps=1, batch_size=batch_size * n_tasks)
@@ -137,7 +137,7 @@ def _plain_env(n_tasks: int) -> Any:
     return DummyVecEnv([partial(Nothing, OBS_DIM + n_tasks)] * n_tasks)
 
 
-def _prepare(model: Any, n_tasks: int, stored: int) -> None:
+def prepare(model: Any, n_tasks: int, stored: int) -> None:
     """Fill the buffer with noise, and give the model the logger that ``learn`` would."""
     from stable_baselines3.common.logger import configure
 

@@ -12,9 +12,10 @@ import types
 import numpy as np
 import pytest
 
-from benchmarks import gpu_mt10, harness, report, training_loop, update
+from benchmarks import gpu_mt10, harness, methods, report, toy_methods, training_loop, update
 from sb3_ars import ARSSAC, make_toy_env
 from sb3_ars.errors import ConfigError
+from sb3_ars.experiments import preset_names
 from sb3_ars.experiments.config import load_preset
 
 TINY = {"batch_size": 4, "net_arch": [8], "stored": 10}
@@ -185,8 +186,34 @@ def test_the_page_on_performance_has_every_table_and_no_number_beside_them():
     page = report.PAGES[0].read_text()
     for name in (*report.BLOCKS, *report.PANELS):
         assert f"<!-- begin: {name} -->" in page, name
+    assert numbers_in_prose(page) == []
+
+
+def numbers_in_prose(page):
     prose = re.sub(r"`[^`]*`|\]\([^)]*\)", "", report.outside_blocks(page))
-    assert re.findall(r"(?<![\w*])\d[\d.,]*(?!\w)", prose) == []
+    return re.findall(r"(?<![\w*])\d[\d.,]*(?!\w)", prose)
+
+
+def test_the_methods_pages_have_their_tables():
+    overview = report.METHODS_PAGE.read_text()
+    for name in report.METHOD_BLOCKS:
+        assert f"<!-- begin: {name} -->" in overview, name
+    assert numbers_in_prose(overview) == []
+    for method in report.METHODS:
+        page = (report.METHOD_PAGES / f"{method.page}.md").read_text()
+        kinds = {"toy": method.alone or method.with_ars, "cost": method.cost}
+        for kind in (kind for kind, measured in kinds.items() if measured):
+            assert f"<!-- begin: {kind}-{method.page} -->" in page, (kind, method.page)
+
+
+def test_the_table_of_methods_has_every_arm_and_every_timed_network_once():
+    arms = [arm for method in report.METHODS for arm in (method.alone, method.with_ars) if arm]
+    assert sorted(arms) == sorted(toy_methods.ARMS)
+    assert {method.cost for method in report.METHODS if method.cost} == set(methods.LABELS)
+    presets = preset_names()
+    for name in methods.LABELS:
+        assert {f"mt10-{name}", f"mt50-{name}"} <= set(presets)
+    assert set(toy_methods.ARMS.values()) <= set(presets)
 
 
 @pytest.mark.parametrize("name", ["env_steps", "update", "training_loop"])
@@ -198,6 +225,147 @@ def test_the_stored_figures_follow_from_the_stored_seconds(name):
         for key, row in rows.items():
             assert row["speedup"] == pytest.approx(again[key]["speedup"], rel=1e-3)
             assert row["median_seconds"] == pytest.approx(again[key]["median_seconds"], rel=1e-3)
+
+
+# ---------------------------------------------------------------------- the methods, timed
+
+
+def test_a_methods_figures_compare_what_they_say():
+    seconds = {"sac-mt10": [1.0, 2.0, 1.0], "sac-mt10-at-50": [4.0, 8.0, 4.0]}
+    seconds |= {
+        "moore-mt10": [3.0, 6.0, 3.0],
+        "moore-mt10-at-50": [18.0, 36.0, 18.0],
+        "moore-mt50": [24.0, 40.0, 24.0],
+    }
+    found = methods.compared("moore", seconds)
+    assert {case: row["times"] for case, row in found["cases"].items()} == {
+        "mt10": 3.0, "mt10-at-50": 4.5, "mt50": 6.0,
+    }  # fmt: skip
+    assert (found["cases"]["mt50"]["times_low"], found["row_cost"]["times"]) == (5.5, pytest.approx(1.2))
+    measured = {"moore": found, "pcgrad": methods.compared("sac", seconds)}
+    reached = {entry["goal"]: entry["reached"] for entry in methods.goals(measured)}
+    assert reached == {
+        "update, 10 tasks: MOORE, times SAC-MT's time": True,
+        "update, 50 tasks: MOORE, times SAC-MT's time": False,  # its MT50 network, not MT10's
+        "update, 10 tasks: PCGrad, times SAC-MT's time": True,
+        "update: MOORE, cost per row at 50 tasks over that at 10": True,
+    }
+
+
+def test_only_networks_that_differ_are_timed_again_at_fifty_tasks():
+    again = {name for name in methods.LABELS if "mt50" in methods.configs_of(name)}
+    assert again == {"moore", "paco", "ars-lora", "ars-lora-paper"}
+
+
+@pytest.mark.parametrize("name", methods.LABELS)
+def test_every_methods_update_can_be_timed_at_any_number_of_tasks(name):
+    small = toy_methods.toy_config(f"mt10-{name}", 0)
+    small = dataclasses.replace(small, algorithm=dataclasses.replace(small.algorithm, batch_size=4))
+    model = methods.make_model(small, n_tasks=3, stored=10)
+    assert model.n_tasks == 3 and model.lora_is_enabled == ("lora" in name)
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    assert methods.make_update(small, n_tasks=3, stored=10)(1) > 0.0
+    model.train(gradient_steps=1, batch_size=4)
+    changed = [not (new == old).all() for new, old in zip(model.actor.parameters(), before, strict=True)]
+    assert any(changed) and all(changed) == ("lora" not in name)
+
+
+def test_an_updates_memory_holds_networks_targets_gradients_and_moments():
+    config = load_preset("mt10-sac")
+    found = harness.run_alone(functools.partial(methods.memory_of, config, 2, 100), cpus=1)
+    assert found["parameters"] == found["learned_parameters"] > 1_000_000
+    assert 4.5 < found["peak_bytes"] / (4 * found["parameters"]) < 40  # 4 and the targets; and activations
+
+
+def test_the_methods_stored_figures_follow_from_the_stored_seconds():
+    result = RESULTS["methods"]
+    assert set(result["methods"]) == set(methods.LABELS)
+    for name, found in result["methods"].items():
+        seconds = {f"{name}-{case}": row["seconds"] for case, row in found["cases"].items()}
+        bases = ("mt10", "mt10-at-50")
+        seconds |= {f"sac-{case}": found["cases"][case]["baseline_seconds"] for case in bases}
+        again = methods.compared(name, seconds)
+        assert found["row_cost"]["times"] == pytest.approx(again["row_cost"]["times"], rel=1e-3)
+        for case, row in found["cases"].items():
+            assert row["times"] == pytest.approx(again["cases"][case]["times"], rel=1e-3)
+
+
+# ---------------------------------------------------------------------- the methods on the toy tasks
+
+
+def test_an_arm_is_its_presets_method_in_the_toys_sizes():
+    config, toy = toy_methods.toy_config("mt50-moore-ars", 3), load_preset("toy")
+    assert config.policy.net_arch == (64, 64) and config.policy.body_options["n_experts"] == 6
+    assert config.ars.param_resets == [6000] and config.ars.reward_scaling == "mean"
+    assert (config.seed, config.env, config.algorithm.batch_size) == (3, toy.env, toy.algorithm.batch_size)
+    soft = toy_methods.toy_config("mt10-soft-modules", 0).policy.body_options
+    assert (soft["n_layers"], soft["n_modules"], soft["module_width"], soft["gate_width"]) == (2, 4, 32, 64)
+    adapters = toy_methods.toy_config("mt10-ars-lora", 0).ars
+    assert adapters.lora["rank"] == 4 and adapters.param_resets == [6000, 18_000]
+    smt = toy_methods.toy_config("mt10-smt", 0)
+    assert (smt.schedule.name, smt.schedule.pool_size, smt.algorithm.train_freq) == ("smt", 2, 2)
+    assert smt.ars.reset == "actor_critic" and smt.ars.reset_times(24_000, 4) == []
+    hard = toy_methods.toy_config("mt10-ablation-fixed-100-hard", 0).ars
+    assert hard.reward_scaling == {"point-west": 100.0, "point-south": 100.0}
+    assert toy_methods.toy_config("mt10-tqc", 0).algorithm.algorithm == "ARSTQC"
+    assert toy_methods.toy_config("mt10-pcgrad", 0).ars.gradient == "pcgrad"
+    assert toy_methods.toy_config("mt10-popart-100", 0).policy.critic_body_options["update_period"] == 100
+
+
+def test_no_two_arms_are_the_same_and_all_have_the_same_budget():
+    configs = [toy_methods.arm_config(arm, 0) for arm in toy_methods.ARMS]
+    assert len({repr(config) for config in configs}) == len(configs)
+    assert {
+        (c.algorithm.total_timesteps, c.algorithm.learning_rate, c.algorithm.batch_size) for c in configs
+    } == {(toy_methods.TOTAL_TIMESTEPS, toy_methods.LEARNING_RATE, 64)}
+
+
+def test_the_toy_table_goes_on_where_it_stopped_and_keeps_what_succeeded(tmp_path, capsys):
+    # a reset at a quarter of so few steps falls in the random phase, which is refused; without resets they are enough
+    run = functools.partial(
+        toy_methods.measure, seeds=1, processes=1, folder=tmp_path, fresh=False, total_timesteps=400
+    )
+    assert run(["sac", "ars"]) == ["ars, seed 0"]
+    assert "param_resets asks for 1 resets" in capsys.readouterr().err
+    path = tmp_path / "toy_methods.json"
+    written = path.read_text()
+    (stored,) = json.loads(written)["runs"]["sac"].values()
+    assert len(stored["success"]) == 4 and stored["updates"] == 36 and stored["seconds"] > 0
+    assert run(["sac"]) == [] and "1 runs, 1 of them are in the file already" in capsys.readouterr().out
+    assert path.read_text() == written
+    with pytest.raises(SystemExit, match="--fresh"):
+        run(["sac"], total_timesteps=800)
+
+
+def fake_toy_results():
+    runs = {
+        "0": {"success": [1.0, 1.0, 0.5, 0.1], "seconds": 2.0},
+        "1": {"success": [1.0, 0.8, 0.5, 0.3], "seconds": 4.0},
+    }
+    return {"runs": {"sac": runs, "moore-ars": runs}, "reward_scales": [10, 1, 0.1, 0.1]}
+
+
+def test_the_methods_tables_come_from_the_files_alone():
+    seconds = {"sac-mt10": [1.0], "sac-mt10-at-50": [4.0], "moore-mt10": [3.0], "moore-mt10-at-50": [18.0]}
+    cost = methods.compared("moore", seconds)
+    for row in cost["cases"].values():
+        row |= {"peak_bytes": 2e6, "times_baseline_bytes": 1.5, "learned_parameters": 1234}
+    results = {"toy_methods": fake_toy_results(), "methods": {"methods": {"moore": cost}}}
+    overview = report.render("methods", results)
+    assert "| [MOORE](methods/moore.md) | ? | 0.65 (0.20) | 3.00 | 1.50 | 4.50 | 1.50 |" in overview
+    assert "| [SMT](methods/smt.md) | ? | - | ? | ? | ? | ? |" in overview
+    of_page = report.render("toy-moore", results).splitlines()[2:]
+    assert of_page == [
+        "| SAC-MT | 1.00 | 0.90 | 0.50 | 0.20 | 0.65 | 0.10 | 3 | 2 |",
+        "| ARS + MOORE | 1.00 | 0.90 | 0.50 | 0.20 | 0.65 | 0.10 | 3 | 2 |",
+    ]
+    assert (
+        "| MOORE, 10 tasks, same network | 3000 ms | 3.00 | 3.00 to 3.00 | 2 MB | 1.50 | 1,234 |"
+        in report.render("cost-moore", results)
+    )
+    assert report.render("toy-moore", {}) == report.render("cost-moore", {}) == report.UNMEASURED
+    with pytest.raises(KeyError, match=r"no block 'toy-more'.*PAGE one of .*moore"):
+        report.render("toy-more", results)
 
 
 # ---------------------------------------------------------------------- the run on a GPU, on the CPU

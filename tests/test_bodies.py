@@ -175,6 +175,7 @@ def test_activation_is_the_one_asked_for(name):
 
 
 @every_body
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated")  # torch.compile's about torch
 @pytest.mark.parametrize("task_major", [False, True])
 def test_one_graph_holds_the_whole_body(name, task_major):
     # what needs a graph break (data-dependent control flow, a wait for the device) cannot be captured either

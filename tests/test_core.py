@@ -182,6 +182,18 @@ def test_quantile_huber_loss_by_hand():
     assert loss.flatten().tolist() == pytest.approx([0.03125, 0.375])
 
 
+@pytest.mark.parametrize("rows", [1, 7, 450])  # more than are computed at once
+def test_the_fused_quantile_loss_and_its_gradient_are_the_plain_ones(rows):
+    generator = th.Generator().manual_seed(rows)
+    quantiles = (2 * th.randn(rows, 2, 5, generator=generator)).requires_grad_()
+    target, weight = 2 * th.randn(rows, 8, generator=generator), th.rand(rows, 1, generator=generator)
+    plain, fused = (TQCObjective(2, fused=fused).loss(quantiles, target) for fused in (False, True))
+    by_row = plain.mean(dim=(1, 2, 3)).unsqueeze(1)
+    assert fused.shape == (rows, 1) and th.allclose(by_row, fused, rtol=1e-5)
+    expected, found = (th.autograd.grad((loss * weight).sum(), quantiles)[0] for loss in (by_row, fused))
+    assert th.allclose(expected, found, rtol=1e-4, atol=1e-7)
+
+
 def test_quantile_huber_loss_has_sb3_contribs_mean():
     quantiles, target = th.randn(7, 2, 5), th.randn(7, 8)
     expected = contrib_quantile_huber_loss(quantiles, target[:, None], sum_over_quantiles=False)

@@ -53,4 +53,4 @@ class ARSTQC(MultiTaskOffPolicyAlgorithm, TQC):
 
     def _make_objective(self) -> Objective:
         n_drop = self.top_quantiles_to_drop_per_net * self.critic.n_critics
-        return TQCObjective(n_drop, self.actor_value)
+        return TQCObjective(n_drop, self.actor_value, fused=self._plan.execution == "fused")

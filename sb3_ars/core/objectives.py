@@ -6,9 +6,10 @@ Critic outputs have shape ``(rows, n_critics, n_outputs)``; rows are task-major,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch as th
+from torch.autograd.function import once_differentiable
 
 __all__ = ["ActorValue", "Objective", "SACObjective", "TQCObjective", "quantile_huber_loss"]
 
@@ -63,12 +64,14 @@ class TQCObjective:
 
     :param n_quantiles_to_drop: how many of the largest pooled target quantiles are dropped, over all critics
     :param actor_value_of: the mean over ``"all"`` critics and quantiles, or over the ``"first"`` critic's
+    :param fused: compute the loss with its gradient, some rows at a time: the same up to rounding, and faster on a CPU
 
     Source: TQC (Kuznetsov et al. 2020), reductions as in sb3-contrib.
     """
 
     n_quantiles_to_drop: int
     actor_value_of: ActorValue = "all"
+    fused: bool = False
 
     def next_value(self, q: th.Tensor) -> th.Tensor:
         """Return the smallest pooled quantiles, sorted, ``(rows, kept)``."""
@@ -76,8 +79,11 @@ class TQCObjective:
         return pooled[:, : pooled.shape[1] - self.n_quantiles_to_drop]
 
     def loss(self, q: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """Return the quantile Huber loss element by element, ``(rows, n_critics, n_quantiles, kept)``."""
-        return quantile_huber_loss(q, target)
+        """Return the quantile Huber loss, ``(rows, n_critics, n_quantiles, kept)``; where ``fused``, rows' means."""
+        if not self.fused:
+            return quantile_huber_loss(q, target)
+        loss: th.Tensor = _RowQuantileHuberLoss.apply(q, target)  # type: ignore[no-untyped-call]  # torch leaves it untyped
+        return loss
 
     def actor_value(self, q: th.Tensor) -> th.Tensor:
         """Return the mean over quantiles and critics, or over the first critic's quantiles, ``(rows, 1)``."""
@@ -100,3 +106,33 @@ def quantile_huber_loss(quantiles: th.Tensor, target: th.Tensor) -> th.Tensor:
     magnitude = error.abs()
     huber = th.where(magnitude > 1, magnitude - 0.5, error**2 * 0.5)
     return (midpoint[:, None] - (error.detach() < 0).float()).abs() * huber
+
+
+class _RowQuantileHuberLoss(th.autograd.Function):
+    """Each row's mean of :func:`quantile_huber_loss`, ``(rows, 1)``.
+
+    All pairs of thousands of rows leave a processor's caches, and each of autograd's steps would pass over them again.
+    """
+
+    _ROWS_AT_ONCE = 200
+
+    @staticmethod
+    def forward(ctx: Any, quantiles: th.Tensor, target: th.Tensor) -> th.Tensor:
+        size, n_quantiles = _RowQuantileHuberLoss._ROWS_AT_ONCE, quantiles.shape[2]
+        midpoint = (th.arange(n_quantiles, device=quantiles.device).unsqueeze(1) + 0.5) / n_quantiles
+        losses, gradients = [], []
+        for q, y in zip(th.split(quantiles, size), th.split(target, size), strict=True):
+            error = y[:, None, None, :] - q.unsqueeze(3)
+            clipped = error.clamp(-1, 1)
+            slope = (midpoint - (error < 0).float()).abs_().mul_(clipped)
+            # huber(e) = clip(e) (e - clip(e) / 2), whose derivative is clip(e)
+            losses.append((slope * error.sub_(clipped, alpha=0.5)).mean(dim=(1, 2, 3)))
+            gradients.append(slope.sum(dim=3) / -slope[0].numel())
+        ctx.save_for_backward(th.cat(gradients))
+        return th.cat(losses).unsqueeze(1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * grad.unsqueeze(2), None

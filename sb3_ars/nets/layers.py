@@ -10,7 +10,15 @@ import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_ars.nets.mlp import MLP, Precision, _product, _weight_gradient
+from sb3_ars.nets.mlp import (
+    _FUSABLE,
+    MLP,
+    Precision,
+    _Fusable,
+    _product,
+    _through_activation,
+    _weight_gradient,
+)
 
 __all__ = [
     "Body",
@@ -18,6 +26,7 @@ __all__ = [
     "ByTask",
     "StackedLayerNorm",
     "StackedLinear",
+    "StackedMLP",
     "TaskLinear",
     "stacked_product",
     "trunk",
@@ -163,17 +172,42 @@ class StackedLinear(nn.Module):
             self.weight.copy_(self.weight[0].clone())
         nn.init.zeros_(self.bias)
 
-    def forward(self, x: th.Tensor) -> th.Tensor:
+    def forward(self, x: th.Tensor, activation: _Fusable = "none") -> th.Tensor:
         """Return ``(n_copies, rows, out_features)``, float32.
 
         :param x: ``(rows, in_features)`` for all copies, or ``(n_copies, rows, in_features)``
+        :param activation: done in the same call; only where ``fused``
         """
         if x.dim() == 3:
-            return stacked_product(x, self.weight, self.bias, self.fused, self.precision)
+            return stacked_product(x, self.weight, self.bias, self.fused, self.precision, activation)
         if self.fused:
-            return stacked_product(x.expand(len(self.weight), *x.shape), self.weight, self.bias, fused=True)
+            x = x.expand(len(self.weight), *x.shape)
+            return stacked_product(x, self.weight, self.bias, fused=True, activation=activation)
         wide = nn.functional.linear(x, self.weight.flatten(0, 1), self.bias.flatten())
         return wide.view(-1, *self.bias.shape).transpose(0, 1)
+
+
+class StackedMLP(nn.Sequential):
+    """``nn.Sequential`` of stacked layers and activations; where ``fused``, a layer and its activation are one call."""
+
+    fused: bool = False
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Return ``(n_copies, rows, out_features)``, float32.
+
+        :param x: ``(rows, in_features)``
+        """
+        layers = list(self)
+        skip = False
+        for layer, following in zip(layers, [*layers[1:], layers[-1]], strict=True):
+            activation = _FUSABLE.get(type(following), "none")
+            if skip:
+                skip = False
+            elif self.fused and isinstance(layer, StackedLinear):
+                x, skip = layer(x, activation), activation != "none"
+            else:
+                x = layer(x)
+        return x
 
 
 class StackedLayerNorm(nn.Module):
@@ -213,46 +247,57 @@ def trunk(
 
 
 def stacked_product(
-    x: th.Tensor, weight: th.Tensor, bias: th.Tensor, fused: bool = False, precision: Precision = "fp32"
+    x: th.Tensor,
+    weight: th.Tensor,
+    bias: th.Tensor,
+    fused: bool = False,
+    precision: Precision = "fp32",
+    activation: _Fusable = "none",
 ) -> th.Tensor:
-    """Return x_k W_k^T + b_k for every k, float32, ``(n, rows, out_features)``.
+    """Return activation(x_k W_k^T + b_k) for every k, float32, ``(n, rows, out_features)``.
 
     :param x: ``(n, rows, in_features)``
     :param weight: ``(n, out_features, in_features)``
     :param bias: ``(n, out_features)``
     :param fused: one oneDNN call for each k, CPU only
     :param precision: of the operands
+    :param activation: only where ``fused``
     """
     dtype = th.bfloat16 if precision == "bf16" else th.float32
     x, weight, bias = x.to(dtype), weight.to(dtype), bias.to(dtype)
     if not fused:
         return th.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2)).float()
-    out: th.Tensor = _StackedProduct.apply(x, weight, bias)  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    out: th.Tensor = _StackedProduct.apply(x, weight, bias, activation)  # type: ignore[no-untyped-call]  # torch leaves it untyped
     return out.float()
 
 
 class _StackedProduct(th.autograd.Function):
-    """x_k W_k^T + b_k and its gradients in oneDNN calls.
+    """activation(x_k W_k^T + b_k) and its gradients in oneDNN calls.
 
     Rows are made contiguous first: for rows of a strided view, as mixing leaves them, oneDNN takes a path that is a
     hundred times slower.
     """
 
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+    def forward(
+        ctx: Any, x: th.Tensor, weight: th.Tensor, bias: th.Tensor, activation: _Fusable
+    ) -> th.Tensor:
         if x.stride(0) > 0:  # one input for all copies is one already
             x = x.contiguous()
-        ctx.save_for_backward(x, weight)
-        return th.stack([_product(*one) for one in zip(x, weight, bias, strict=True)])
+        out = th.stack([_product(*one, activation) for one in zip(x, weight, bias, strict=True)])
+        ctx.activation = activation
+        ctx.save_for_backward(x, weight, out)
+        return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        x, weight = ctx.saved_tensors
-        grad = grad.contiguous()
-        of_x, of_weight, of_bias = ctx.needs_input_grad
+        x, weight, out = ctx.saved_tensors
+        grad = _through_activation(grad.contiguous(), out, ctx.activation)
+        of_x, of_weight, of_bias, _ = ctx.needs_input_grad
         return (
             th.stack([_product(g, w.t()) for g, w in zip(grad, weight, strict=True)]) if of_x else None,
             th.stack([_weight_gradient(g, i) for g, i in zip(grad, x, strict=True)]) if of_weight else None,
             grad.sum(1, dtype=th.float32) if of_bias else None,
+            None,
         )

@@ -107,10 +107,7 @@ class _Linear(th.autograd.Function):
     def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:
         x, weight, out = ctx.saved_tensors
         of_x, of_weight, of_bias, _ = ctx.needs_input_grad
-        if ctx.activation == "relu":
-            grad = th.ops.aten.threshold_backward(grad, out, 0)
-        elif ctx.activation == "tanh":
-            grad = th.ops.aten.tanh_backward(grad, out)
+        grad = _through_activation(grad, out, ctx.activation)
         return (
             _product(grad, weight.t()) if of_x else None,
             _weight_gradient(grad, x) if of_weight else None,
@@ -134,6 +131,15 @@ class _Tanh(th.autograd.Function):
         (out,) = ctx.saved_tensors
         gradient: th.Tensor = th.ops.aten.tanh_backward(grad, out)
         return gradient
+
+
+def _through_activation(grad: th.Tensor, out: th.Tensor, activation: _Fusable) -> th.Tensor:
+    """Return the gradient before the activation, from the one after it and its output."""
+    if activation == "relu":
+        grad = th.ops.aten.threshold_backward(grad, out, 0)
+    elif activation == "tanh":
+        grad = th.ops.aten.tanh_backward(grad, out)
+    return grad
 
 
 def _product(

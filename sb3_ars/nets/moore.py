@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import torch as th
 from torch import nn
 
-from sb3_ars.nets.layers import Body, BodyShape, StackedLayerNorm, StackedLinear, TaskLinear
+from sb3_ars.nets.layers import Body, BodyShape, StackedLayerNorm, StackedLinear, StackedMLP, TaskLinear
 
 __all__ = ["MOORE", "orthonormal", "orthonormal_coefficients"]
 
 # of a residual's length to its expert's: float32 leaves 1e-7 where 0 is meant, which must not be blown up to 1
 _RELATIVE_FLOOR = 1e-4
 _ABSOLUTE_FLOOR = 1e-6  # of any length, for experts that give zero
+
+
+_ROWS_AT_ONCE = 500  # on a CPU: the experts' outputs for more rows leave its caches
 
 
 class MOORE(Body):
@@ -26,6 +30,8 @@ class MOORE(Body):
     Source: Hendawy et al. 2024, section 4. The one-hot in the experts' input is the ARS authors' code's; the original
     has none. Deviation: floors under the lengths in :func:`orthonormal`, where the original divides by zero.
     """
+
+    fused: bool = False  # see :class:`~sb3_ars.nets.mlp.MLP`
 
     def __init__(
         self,
@@ -43,19 +49,24 @@ class MOORE(Body):
             layers += [StackedLayerNorm(n_experts, next_width)] if layer_norm else []
             layers.append(activation())
         layers.append(StackedLinear(n_experts, widths[-2], widths[-1]))
-        self.experts = nn.Sequential(*layers)
+        self.experts = StackedMLP(*layers)
         self.mixture = nn.Linear(n_tasks, n_experts, bias=False)  # w_i is its column i
         nn.init.xavier_normal_(self.mixture.weight)
         self.heads = TaskLinear(widths[-1], out_features, n_tasks)
 
     def compute(self, x: th.Tensor, task: th.Tensor, task_major: bool) -> th.Tensor:
         """Return ``(rows, out_features)``; see :meth:`Body.compute`."""
+        size = _ROWS_AT_ONCE if self.fused else len(x)
+        parts = zip(th.split(x, size), th.split(task, size), strict=True)
+        features = [self._features(*part) for part in parts]
+        out: th.Tensor = self.heads(th.cat(features), task, task_major)
+        return out
+
+    def _features(self, x: th.Tensor, task: th.Tensor) -> th.Tensor:
         vectors = self.experts(x)
         # V w = U (T^t w): the basis itself is not needed
         weights = self.mixture(task).double().unsqueeze(1) @ orthonormal_coefficients(vectors)
-        features = th.tanh((vectors * weights.float().permute(2, 0, 1)).sum(dim=0))
-        out: th.Tensor = self.heads(features, task, task_major)
-        return out
+        return th.tanh((vectors * weights.float().permute(2, 0, 1)).sum(dim=0))
 
 
 def orthonormal(vectors: th.Tensor) -> th.Tensor:
@@ -78,8 +89,7 @@ def orthonormal_coefficients(vectors: th.Tensor) -> th.Tensor:
 
     :param vectors: ``(n_vectors, rows, width)``
     """
-    by_row = vectors.transpose(0, 1).double()
-    gram = by_row @ by_row.transpose(1, 2)
+    gram: th.Tensor = _Gram.apply(vectors)  # type: ignore[no-untyped-call]  # torch leaves it untyped
     eye = th.eye(len(vectors), dtype=gram.dtype, device=gram.device)
     basis: list[th.Tensor] = []
     for k, own in enumerate(eye):
@@ -93,3 +103,20 @@ def orthonormal_coefficients(vectors: th.Tensor) -> th.Tensor:
         floor = _RELATIVE_FLOOR**2 * gram[:, k, k, None] + _ABSOLUTE_FLOOR**2
         basis.append(rest * (square + floor).rsqrt())
     return th.stack(basis, dim=1)
+
+
+class _Gram(th.autograd.Function):
+    """u_k.u_m for every row, ``(rows, n_vectors, n_vectors)``, float64; one product back, where autograd does two."""
+
+    @staticmethod
+    def forward(ctx: Any, vectors: th.Tensor) -> th.Tensor:
+        ctx.save_for_backward(vectors)
+        by_row = vectors.transpose(0, 1).double()
+        return by_row @ by_row.transpose(1, 2)
+
+    @staticmethod
+    def backward(ctx: Any, grad: th.Tensor) -> th.Tensor:
+        (vectors,) = ctx.saved_tensors
+        # dU = (G + G^t) U
+        of_rows: th.Tensor = (grad + grad.transpose(1, 2)) @ vectors.transpose(0, 1).double()
+        return of_rows.to(vectors.dtype).transpose(0, 1)
