@@ -95,11 +95,13 @@ def toy_config(preset: str, seed: int, total_timesteps: int = TOTAL_TIMESTEPS) -
         critic_body=method.policy.critic_body,
         critic_body_options=_body_options(method.policy.critic_body, method.policy.critic_body_options),
     )
-    schedule = dataclasses.replace(
-        method.schedule,
-        pool_size=min(method.schedule.pool_size, AT_MOST["pool_size"]),
-        interval=max(1, total_timesteps // 24),  # ten episodes of each task in the pool, as on Meta-World
-    )
+    schedule = method.schedule
+    if schedule.name != "none":
+        schedule = dataclasses.replace(
+            schedule,
+            pool_size=min(schedule.pool_size, AT_MOST["pool_size"]),
+            interval=max(1, total_timesteps // 24),  # ten episodes of each task in the pool, as on Meta-World
+        )
     return dataclasses.replace(
         toy,
         seed=seed,

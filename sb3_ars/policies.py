@@ -347,6 +347,9 @@ class _PolicyOptions:
 def _check_bodies(
     body: Mapping[str, Any] | None, critic_body: Mapping[str, Any] | None, lora: Mapping[str, Any] | None
 ) -> None:
+    for given in (body, critic_body):
+        if given is not None:
+            body_config(given)
     if body is not None and body.get("name") == "popart":
         raise ConfigError(
             "body='popart' is an output layer of critics; give it as critic_body, and leave body None."

@@ -348,3 +348,31 @@ def test_a_schedule_that_cannot_work_is_refused_before_training(tmp_path):
     with pytest.raises(ConfigError, match="pool_size=4 holds all 4 tasks"):
         train(config, "toy", progress_bar=False)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"schedule": {"name": "SMT"}}, "name='SMT' is unknown; choose one of none, smt"),
+        (
+            {"schedule": {"pool_size": 2}},
+            "schedule.pool_size=2 goes with a schedule, but schedule.name is none",
+        ),
+        (
+            {"policy": {"body": "moore", "body_options": {"name": "paco"}}},
+            "body_options=.* its name not among them",
+        ),
+        ({"policy": {"body": "moore", "body_options": [4]}}, "body_options=.* must be a mapping"),
+        ({"policy": {"net_arch": [8, 0]}}, "policy.net_arch entry=0 must be an integer of at least 1"),
+        ({"policy": {"net_arch": 8}}, "policy.net_arch=8 must be a list of widths"),
+        (
+            {"policy": {"actor_activation": "gelu"}},
+            "actor_activation='gelu' is unknown; choose one of relu, tanh",
+        ),
+        ({"algorithm": {"algorithm": "SAC"}}, "algorithm='SAC' is unknown.*Did you mean 'ARSSAC'"),
+    ],
+)
+def test_values_a_file_cannot_have_are_refused_by_name(values, message, tmp_path):
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
+    with pytest.raises(ConfigError, match=message):
+        load_config(tmp_path / "config.yaml")

@@ -16,6 +16,7 @@ from sb3_ars.envs.toy import PointTask
 from sb3_ars.experiments.config import load_preset
 from sb3_ars.experiments.runner import build_model
 from sb3_ars.nets.layers import ByTask, TaskLinear
+from sb3_ars.nets.lora import LoRALinear
 
 BODIES = {
     "multi_head": {"name": "multi_head"},
@@ -285,8 +286,8 @@ def test_adapters_come_late_in_the_run_and_stay(algorithm, lora, tmp_path, capsy
 
 @ALGORITHMS
 def test_enabling_adapters_changes_no_output(algorithm):
-    lora = {"rank": 3, "start": 0.5, "min_success": 1.0, "rescale_critic": False}  # never by itself
-    model = make(algorithm, lora=lora, layer_norm=True).learn(600)
+    lora = {"rank": 3, "rescale_critic": False}
+    model = make(algorithm, lora=lora, layer_norm=True).learn(600, callback=NoResets())
     batch = model.replay_buffer.sample(8)
     networks = (model.critic, model.critic_target)
 
@@ -309,7 +310,7 @@ def test_enabling_adapters_changes_no_output(algorithm):
 
 
 def test_a_frozen_critics_values_follow_the_reward_scale():
-    model = make(lora={"rank": 3, "start": 0.5, "min_success": 1.0}).learn(600)
+    model = make(lora={"rank": 3}).learn(600, callback=NoResets())
     batch = model.replay_buffer.sample(8)
     before = model.critic.q_values(batch.observations, batch.actions)
     model.enable_lora()
@@ -407,7 +408,12 @@ def test_pcgrad_changes_the_update_only_where_tasks_conflict():
         ({"lora": {"rank": 0}}, "lora option rank=0 must be an integer of at least 1"),
         ({"lora": {"ranks": 4}}, "lora has no option 'ranks'.*Did you mean 'rank'"),
         ({"lora": {"rank": 4}, "body": "moore"}, "lora adapts the plain network; leave body out"),
-        ({"lora": {"rank": 4}, "reset": "none"}, "lora is enabled at a reset time, but reset='none'"),
+        ({"lora": {"rank": 4}, "reset": "none"}, "lora takes the place of resets.*but reset='none'"),
+        ({"lora": {"rank": 4}, "reset": "critic"}, "lora takes the place of resets.*but reset='critic'"),
+        ({"more_policy": {"lora": {"rank": 4}}}, "lora belongs to ARSSAC's own arguments"),
+        ({"more_policy": {"body": "moore"}}, "body='moore' must be a mapping of options"),
+        ({"critic_body": "popart"}, "body='popart' must be a mapping of options"),
+        ({"body": {"name": ["moore"]}}, "body name=.'moore'. is unknown"),
         ({"lora": {"rank": 4, "start": 75}}, "lora option start=75 must be between 0 and 1"),
         ({"max_task_loss": 0}, "max_task_loss=0 must be a positive number"),
         (
@@ -481,3 +487,65 @@ def test_adapters_that_would_never_come_are_refused_before_training():
     model = make(lora={"rank": 3, "start": 0.9}, n_reset=1)
     with pytest.raises(ConfigError, match="lora adds its adapters at the first reset from step 900"):
         model.learn(1000)
+
+
+def test_a_reset_of_an_adapted_model_renews_the_adapters_alone():
+    model = make(lora={"rank": 3}).learn(600, callback=NoResets())
+    model.enable_lora()
+    model.train(3, 8)
+    base = [p.clone() for p in model.critic.parameters() if not p.requires_grad]
+    model.reset_networks()
+    assert all(map(th.equal, base, (p for p in model.critic.parameters() if not p.requires_grad)))
+    assert all((layer.lora_b == 0).all() for layer in model.critic.modules() if isinstance(layer, LoRALinear))
+
+
+def test_adapters_that_success_does_not_allow_are_reported():
+    model = make(lora={"rank": 3, "start": 0.5, "min_success": 1.0})
+    with pytest.warns(
+        UserWarning, match=r"due at step 300, but the mean training success is .* no reset is left"
+    ):
+        model.learn(600)
+    assert not model.lora_is_enabled and model.n_resets == 1
+    model = make(lora={"rank": 3, "start": 0.5, "min_success": 1.0}, n_reset=2)
+    with pytest.warns(UserWarning, match="the networks are reset instead|no reset is left"):
+        model.learn(900)
+
+
+def test_adapters_may_start_exactly_at_a_reset_time():
+    lora = {"rank": 3, "start": 0.8, "min_success": 0}
+    assert (
+        make(lora=lora, n_reset=4).learn(1004).lora_is_enabled
+    )  # the last reset is at step 803, and so is 0.8 T
+
+
+def test_the_success_that_adapters_wait_for_survives_saving(tmp_path):
+    model = make(n_reset=0).learn(800)
+    for episodes in model.task_episodes:
+        episodes.append({"success": 1.0})
+    model.save(tmp_path / "model")
+    loaded = ARSSAC.load(tmp_path / "model", env=make_toy_env(seed=0))
+    assert loaded.mean_success() == model.mean_success() > 0
+    assert [list(e) for e in loaded.task_episodes] == [list(e) for e in model.task_episodes]
+
+
+def test_adapters_cannot_change_when_a_model_is_loaded(tmp_path):
+    model = make(lora={"rank": 3}).learn(600, callback=NoResets())
+    model.enable_lora()
+    model.save(tmp_path / "model")
+    for lora in ({"rank": 4}, None):
+        with pytest.raises(
+            ConfigError, match=r"adapters were made with lora=.'rank': 3., so it cannot go on"
+        ):
+            ARSSAC.load(tmp_path / "model", lora=lora)
+
+
+def test_the_tasks_cannot_change_in_the_middle_of_a_rollout():
+    model = make(n_reset=0)
+
+    def change(locals_, globals_):
+        model.set_active_tasks([0])
+
+    with pytest.raises(ConfigError, match="in the middle of a rollout"):
+        model.learn(400, callback=change)
+    model.set_active_tasks(["point-east"])  # between two
+    assert model.learn(10, reset_num_timesteps=False)._n_active_envs() == 1

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ars import ARSSAC, make_multitask_env, make_toy_env
 from sb3_ars.callbacks.schedule import TaskScheduleCallback
@@ -495,6 +495,13 @@ def ready_made_env():
             "pool_size=3 holds all 3",
         ),
         (ready_made_env, TaskScheduleCallback(CONFIG), ConfigError, r"DummyVecEnv .* MultiTaskVecEnv"),
+        (known_env, TaskScheduleCallback(), ConfigError, "interval=15000 .* would never change"),
+        (
+            lambda: VecNormalize(known_env(), norm_reward=False),
+            TaskScheduleCallback(CONFIG),
+            ConfigError,
+            "would count the observation of a waiting task",
+        ),
         (
             known_env,
             EveryNTimesteps(10, CallbackList([TaskScheduleCallback(CONFIG)])),
@@ -515,3 +522,31 @@ def test_a_task_that_reports_no_success_is_an_error_at_its_first_episodes_end():
     with pytest.raises(EnvContractError, match=r"Task 'mute' ended an episode without is_success"):
         model.learn(TOTAL, callback=TaskScheduleCallback(CONFIG))
     assert model.num_timesteps == 25
+
+
+def test_an_interrupted_run_leaves_all_tasks_active_and_goes_on_with_its_pools(tmp_path):
+    class Interrupt(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps > 400:
+                raise KeyboardInterrupt
+            return True
+
+    model = model_of(known_env())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(TOTAL, callback=[TaskScheduleCallback(CONFIG), Interrupt()])
+    assert model.active_tasks is None
+    before = model.replay_buffer.task_size.copy()
+    model.learn(48, reset_num_timesteps=False)  # without the schedule
+    assert (model.replay_buffer.task_size - before).tolist() == [12] * 4
+
+
+def test_resets_of_the_schedule_recompute_the_reward_scale():
+    model = model_of(known_env(), reward_scaling="mean", gradient_steps=1)
+    model.learn(TOTAL, callback=TaskScheduleCallback(CONFIG))
+    times = [step for step, _ in model.reward_scale_history]
+    assert model.n_resets > 0 and len(times) == model.n_resets + 1
+
+
+def test_options_that_are_no_config_are_refused():
+    with pytest.raises(ConfigError, match=r"must be an SMTConfig, such as SMTConfig\(pool_size=3\)"):
+        TaskScheduleCallback({"pool_size": 2})

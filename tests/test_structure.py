@@ -134,6 +134,9 @@ def test_the_python_examples_of_the_methods_pages_run(page):
         ):
             assert old in code, old
             code = code.replace(old, new)
+        # what a run this short cannot wait for
+        code = code.replace('"rank": 8', '"rank": 8, "min_success": 0')
+        code = code.replace("pool_size=3", "pool_size=3, interval=40")
         namespace = {}
         exec(code, namespace)
         assert namespace["model"].num_timesteps >= 400 and namespace["model"]._n_updates > 10

@@ -11,8 +11,9 @@ import pathlib
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from typing import Any, TypeVar
 
@@ -188,6 +189,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         max_task_loss: float | None = None,
         lora: dict[str, Any] | None = None,
     ) -> None:
+        if "lora" in (policy_kwargs or {}):
+            raise ConfigError(
+                f"lora belongs to {type(self).__name__}'s own arguments, not to policy_kwargs: there it would freeze "
+                "networks that have learned nothing."
+            )
         config = ARSConfig(
             n_reset,
             param_resets,
@@ -243,8 +249,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.is_multi_task = False
         self.n_resets = 0
         self.resets_looked_for_until = 0
+        self.task_episodes: list[deque[dict[str, float]]] = []  # the latest of each task; TaskLog's
         self.active_tasks: list[int] | None = None  # None is all
         self.schedule_state: dict[str, Any] | None = None  # TaskScheduleCallback's
+        self._stepping_env: WorkWhileStepping | None = None
+        self._is_stepping = False  # from a rollout's first action to its end
         self.scaled_by: str | None = None  # the reward_scaling that c_i comes from
         self.reward_scale_history: list[tuple[int, list[float]]] = []
         if _init_setup_model:
@@ -275,7 +284,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self.log_ent_coef is not None and self.n_tasks > 1:
             self._make_temperature_per_task(self.log_ent_coef)
         self.reward_scale = RewardScale(self.n_tasks, self.device)
-        self._task_log = TaskLog(self.task_names or [], self._stats_window_size)
+        if len(self.task_episodes) != len(self.task_names or []):  # else loaded
+            self.task_episodes = [deque(maxlen=self._stats_window_size) for _ in self.task_names or []]
+        self._task_log = TaskLog(self.task_names or [], self.task_episodes)
         self._warned_of_waiting = False
         self._updates_are_done = False
         self._combiner = MeanGradient() if self.gradient == "mean" else PCGrad()
@@ -378,7 +389,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
                 "tasks and ent_coef='auto'; use task_weighting='equal'."
             )
         critic_body = self.policy_kwargs.get("critic_body")
-        is_popart = isinstance(critic_body, dict) and critic_body.get("name") == "popart"
+        is_popart = isinstance(critic_body, Mapping) and critic_body.get("name") == "popart"
         if is_popart and self.reward_scaling not in (None, "none"):
             raise ConfigError(
                 f"critic_body='popart' normalises each task's values, and reward_scaling={self.reward_scaling!r} would "
@@ -387,11 +398,18 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _check_lora(self) -> None:
         """Raise now, not when the adapters are due, if the networks cannot have them."""
+        built = self.policy_kwargs.get("lora")
+        if built is not None and (self.lora is None or LoRAConfig.of(built) != LoRAConfig.of(self.lora)):
+            raise ConfigError(
+                f"This model's adapters were made with lora={built}, so it cannot go on with lora={self.lora}; leave "
+                "lora out when loading."
+            )
         if self.lora is None:
             return
-        if not self.config.resets():
+        if self.reset != "actor_critic":
             raise ConfigError(
-                "lora is enabled at a reset time, but reset='none' has none; use 'actor_critic'."
+                f"lora takes the place of resets of actor and critic, late in the run, but reset={self.reset!r}; use "
+                "reset='actor_critic'."
             )
         if self._bodies():
             raise ConfigError(f"lora adapts the plain network; leave {' and '.join(self._bodies())} out.")
@@ -494,7 +512,6 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._update_state = self._make_update_state()
         self._captured_updates: CapturedCalls[Metrics] = CapturedCalls()
         self._captured_actor: CapturedActor | None = None
-        self._stepping_env: WorkWhileStepping | None = None
 
     def _make_objective(self) -> Objective:
         """Return SAC's or TQC's objective."""
@@ -533,6 +550,17 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if indices == []:
             raise ConfigError(
                 "set_active_tasks([]) would collect nothing; name at least one task, or None for all."
+            )
+        if self._is_stepping:
+            raise ConfigError(
+                "set_active_tasks() in the middle of a rollout: steps already made would be lost. Call it between two, "
+                "in a callback's _on_rollout_start."
+            )
+        normalizer = self._vec_normalize_env
+        if normalizer is not None and normalizer.norm_obs:
+            raise ConfigError(
+                "VecNormalize(norm_obs=True) would count the observation of a waiting task at every step; use "
+                "norm_obs=False with set_active_tasks and schedules."
             )
         env: Any = self.env
         buffer = self.replay_buffer
@@ -595,7 +623,16 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
         finally:
             self._updates_are_done = False  # a train() of the user's own is not learn()'s
+            self._leave_schedule()
         return self
+
+    def _leave_schedule(self) -> None:
+        """Let all tasks collect where a schedule chose some: it goes on from its own state."""
+        if self.schedule_state is None or self.active_tasks is None:
+            return
+        with suppress(RuntimeError):  # an environment that the error which ended learn() has closed
+            self.set_active_tasks(None)
+        self.active_tasks = None
 
     def _setup_learn(
         self,
@@ -610,6 +647,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._resolve_learning_starts(total_timesteps, starts_afresh)
         if isinstance(self.replay_buffer, TaskReplayBuffer):
             self.replay_buffer.check_memory()
+        self._leave_schedule()
         if self.active_tasks is not None:  # a loaded model's environment and buffer know nothing of it
             self.set_active_tasks(self.active_tasks)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
@@ -683,15 +721,18 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._stepping_env.num_envs = self._n_active_envs()  # what a step counts as
         self._stepping_env.work = partial(self._train_for, train_freq) if self._plan.overlap else None
         self._updates_are_done = False
-        rollout = super().collect_rollouts(
-            self._stepping_env,
-            callback,
-            train_freq,
-            replay_buffer,
-            action_noise,
-            learning_starts,
-            log_interval,
-        )
+        try:
+            rollout = super().collect_rollouts(
+                self._stepping_env,
+                callback,
+                train_freq,
+                replay_buffer,
+                action_noise,
+                learning_starts,
+                log_interval,
+            )
+        finally:
+            self._is_stepping = False
         self._updates_are_done = self._plan.overlap and rollout.continue_training
         return rollout
 
@@ -706,6 +747,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
+        self._is_stepping = True
         try:
             with self.timer("act"):
                 # SB3 2.9.2 (off_policy_algorithm.py) asks for as many actions as it counts steps
@@ -879,10 +921,15 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         ``"actor_critic"`` renews actor, critics, target critics, their optimizers and the temperatures; ``"critic"``
         the critics, target critics and their optimizer. The global random generators are not touched.
 
+        With adapters, they alone are renewed: see :meth:`renew_lora`.
+
         Source: paper, Algorithm 1, line 16. Deviation: fresh weights at each reset, where the authors' code returns to
         the same initial ones.
         """
         if self.reset in (None, "none"):
+            return
+        if self.lora_is_enabled:  # fresh weights would stay as they are drawn, for the base does not learn
+            self.renew_lora()
             return
         self.n_resets += 1
         with self._seeded_by(self.n_resets):

@@ -23,12 +23,12 @@ class TaskLog:
     """Collects what happened per task since the last log entry.
 
     :param task_names: the tasks; empty for a plain environment, which gets SB3's keys alone
-    :param window: number of latest episodes per task that averages run over
+    :param episodes: the latest episodes of each task, which averages run over; filled here, kept by the model
     """
 
-    def __init__(self, task_names: Sequence[str], window: int) -> None:
+    def __init__(self, task_names: Sequence[str], episodes: Sequence[deque[dict[str, float]]]) -> None:
         self.task_names = log_names(task_names)
-        self._episodes: list[deque[dict[str, float]]] = [deque(maxlen=window) for _ in task_names]
+        self._episodes = episodes
         self._sums: Metrics | None = None
         self._n_updates = 0
 
@@ -52,9 +52,8 @@ class TaskLog:
 
     def mean_success(self) -> float:
         """Return the mean over tasks of the latest training episodes' success; NaN while a task has none."""
-        return float(
-            np.mean([np.mean(self.successes(task) or [np.nan]) for task in range(len(self._episodes))])
-        )
+        means = [np.mean(self.successes(task) or [np.nan]) for task in range(len(self._episodes))]
+        return float(np.mean(means)) if means else float("nan")
 
     def add_update(self, metrics: Metrics) -> None:
         """Add one update's metrics to the running sums, on the device."""

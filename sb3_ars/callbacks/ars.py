@@ -13,7 +13,7 @@ from sb3_ars.nets.lora import LoRAConfig
 if TYPE_CHECKING:
     from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 
-__all__ = ["ARSCallback"]
+__all__ = ["ARSCallback", "update_scale_and_networks"]
 
 
 class ARSCallback(BaseCallback):
@@ -51,10 +51,10 @@ class ARSCallback(BaseCallback):
     def _check_reset_times(self) -> None:
         model, times = self.algorithm, self.reset_times
         if model.lora is not None and not model.lora_is_enabled:
-            start = LoRAConfig.of(model.lora).start * model._total_timesteps
+            start = self._lora_start(LoRAConfig.of(model.lora))
             if not times or times[-1] < start:
                 raise ConfigError(
-                    f"lora adds its adapters at the first reset from step {start:.0f} on (lora option start), but the "
+                    f"lora adds its adapters at the first reset from step {start} on (lora option start), but the "
                     f"resets are at {times}. Lower start, reset more often, or name the steps with param_resets."
                 )
         if not times:
@@ -111,11 +111,26 @@ class ARSCallback(BaseCallback):
         Deviation: the authors' code asks the latest evaluation, which a run here need not have.
         """
         model = self.algorithm
-        if model.lora is None:
+        if model.lora is None or model.lora_is_enabled:
             return False
         config = LoRAConfig.of(model.lora)
-        is_late = model.num_timesteps >= config.start * model._total_timesteps
-        return is_late and (config.min_success == 0 or model.mean_success() >= config.min_success)
+        if model.num_timesteps < self._lora_start(config):
+            return False
+        success = model.mean_success()
+        if config.min_success == 0 or success >= config.min_success:
+            return True
+        is_last = model.num_timesteps >= self.reset_times[-1]
+        then = "no reset is left, so there will be none" if is_last else "the networks are reset instead"
+        warnings.warn(
+            f"The adapters of lora are due at step {model.num_timesteps}, but the mean training success is "
+            f"{success:.2f}, not min_success={config.min_success}: {then}. Tasks that report no success need "
+            "min_success=0.",
+            stacklevel=3,
+        )
+        return False
+
+    def _lora_start(self, config: LoRAConfig) -> int:
+        return int(config.start * self.algorithm._total_timesteps)
 
     def reset(self) -> None:
         """Reset the networks, recompute c_i, do the extra updates (Algorithm 1, lines 14 to 17).
@@ -124,22 +139,14 @@ class ARSCallback(BaseCallback):
         afresh every time after.
         """
         model = self.algorithm
-        if model.lora_is_enabled:
-            model.renew_lora()
-            event = "adapters renewed"
-        elif self.lora_is_due():
+        if self.lora_is_due():
             model.enable_lora()
             event = "adapters added"
         else:
+            event = "adapters renewed" if model.lora_is_enabled else f"reset {model.n_resets + 1}"
             model.reset_networks()
-            event = f"reset {model.n_resets}"
-        try:
-            model.update_reward_scale()
-        except ConfigError as error:  # a day of training is not thrown away because a mean turned negative
-            warnings.warn(f"The reward scales stay as they were. {error}", stacklevel=2)
+        update_scale_and_networks(model)
         self._print_scale(event)
-        if model.updates_after_reset > 0:
-            model.train(gradient_steps=model.updates_after_reset, batch_size=model.batch_size)
 
     def _print_scale(self, event: str) -> None:
         model = self.algorithm
@@ -147,3 +154,16 @@ class ARSCallback(BaseCallback):
             return
         scales = zip(model.task_names or [], model.reward_scale.scale.tolist(), strict=True)
         print(f"Step {model.num_timesteps:,}, {event}: " + ", ".join(f"{n} c={c:.3g}" for n, c in scales))
+
+
+def update_scale_and_networks(model: MultiTaskOffPolicyAlgorithm) -> None:
+    """Do what follows a reset: recompute c_i, then the extra updates.
+
+    :param model: whose networks were just reset
+    """
+    try:
+        model.update_reward_scale()
+    except ConfigError as error:  # a day of training is not thrown away because a mean turned negative
+        warnings.warn(f"The reward scales stay as they were. {error}", stacklevel=2)
+    if model.config.resets() and model.updates_after_reset > 0:
+        model.train(gradient_steps=model.updates_after_reset, batch_size=model.batch_size)

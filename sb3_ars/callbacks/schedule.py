@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_ars.callbacks.ars import update_scale_and_networks
 from sb3_ars.core.schedule import POOLS, SMTConfig, SMTSchedule
 from sb3_ars.errors import ConfigError, EnvContractError
 
@@ -38,6 +39,8 @@ class TaskScheduleCallback(BaseCallback):
 
     def __init__(self, config: SMTConfig | None = None, verbose: int = 0) -> None:
         super().__init__(verbose)
+        if config is not None and not isinstance(config, SMTConfig):
+            raise ConfigError(f"config={config!r} must be an SMTConfig, such as SMTConfig(pool_size=3).")
         self.config = config or SMTConfig()
         self.schedule: SMTSchedule | None = None
         """None in the random phase."""
@@ -58,6 +61,7 @@ class TaskScheduleCallback(BaseCallback):
         model = self.algorithm
         self.verbose = max(self.verbose, model.verbose)
         self.config.check_tasks(model.n_tasks)
+        self.config.check_length(model._total_timesteps - model.learning_starts)
         if model.num_timesteps == 0:
             model.schedule_state = None
         self.schedule = None
@@ -66,7 +70,7 @@ class TaskScheduleCallback(BaseCallback):
             self.schedule = self._make_schedule()
             self.schedule.restore(model.schedule_state)
         # also where all tasks are active: an environment that cannot do this refuses now
-        model.set_active_tasks(None if self.schedule is None else self.schedule.active)
+        model.set_active_tasks(range(model.n_tasks) if self.schedule is None else self.schedule.active)
 
     def _on_rollout_start(self) -> None:
         model, schedule = self.algorithm, self.schedule
@@ -79,7 +83,8 @@ class TaskScheduleCallback(BaseCallback):
             new = schedule.decide(model.num_timesteps)
             self._apply(schedule, before)
             if new:
-                self._reset()
+                model.reset_networks()
+                update_scale_and_networks(model)
 
     def _on_step(self) -> bool:
         ended = np.flatnonzero(self.locals["dones"])
@@ -96,7 +101,6 @@ class TaskScheduleCallback(BaseCallback):
     def _on_training_end(self) -> None:
         if self.schedule is not None:
             self._record(self.schedule)
-        self.algorithm.set_active_tasks(None)  # else evaluate_policy on this environment would wait for ever
 
     def _check_batch(self) -> None:
         model = self.algorithm
@@ -134,12 +138,6 @@ class TaskScheduleCallback(BaseCallback):
             changes += [f"{pool}: {', '.join(new)}"] * bool(new)
         if changes:
             print(f"Step {model.num_timesteps:,}, schedule stage {schedule.stage}, now {'; '.join(changes)}")
-
-    def _reset(self) -> None:
-        model = self.algorithm
-        model.reset_networks()
-        if model.updates_after_reset > 0:
-            model.train(gradient_steps=model.updates_after_reset, batch_size=model.batch_size)
 
     def _record(self, schedule: SMTSchedule) -> None:
         for pool in POOLS:

@@ -59,8 +59,7 @@ class SMTConfig:
             check_count(option, getattr(self, option))
         for option in ("first_stage", "budget_share", "solved"):
             _check_share(option, getattr(self, option))
-        if self.unsolvable != 0:
-            _check_share("unsolvable", self.unsolvable)
+        _check_share("unsolvable", self.unsolvable, or_zero=True)
         if self.unsolvable >= self.solved:
             raise ConfigError(
                 f"unsolvable={self.unsolvable} must be less than solved={self.solved}: a task cannot be both."
@@ -78,6 +77,18 @@ class SMTConfig:
             raise ConfigError(
                 f"pool_size={self.pool_size} holds all {n_tasks} tasks, so there would be nothing to choose; use "
                 f"pool_size={n_tasks - 1} or less, or leave the schedule out."
+            )
+
+    def check_length(self, timesteps: int) -> None:
+        """Raise unless the first stage has room for a decision.
+
+        :param timesteps: environment steps after the random phase
+        :raises ConfigError: if ``interval`` is longer than the first stage
+        """
+        if self.interval >= self.first_stage * timesteps:
+            raise ConfigError(
+                f"interval={self.interval} environment steps is as long as SMT's first stage, first_stage="
+                f"{self.first_stage} of {timesteps} steps, so its pool would never change; use a smaller interval."
             )
 
 
@@ -229,7 +240,8 @@ class SMTSchedule:
         return (-math.inf if success is None else success, self._order.index(task))
 
 
-def _check_share(option: str, value: Any) -> None:
+def _check_share(option: str, value: Any, or_zero: bool = False) -> None:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not 0 < value <= 1:
-        raise ConfigError(f"{option}={value!r} must be a number above 0 and at most 1.")
+    if not is_number or not (0 < value <= 1 or (or_zero and value == 0)):
+        lowest = "from 0" if or_zero else "above 0"
+        raise ConfigError(f"{option}={value!r} must be a number {lowest} and at most 1.")

@@ -285,7 +285,7 @@ def update(
                 objective.loss((values - mean[group, None]) / std[group, None], target[group])
                 for values, group in zip(q, groups, strict=True)
             ]
-        weight = _task_weight(errors, ent_coef, n_tasks, hyperparameters)
+        healthy, weight = _task_weight(errors, ent_coef, n_tasks, hyperparameters)
         losses = _weighted(errors, weight)
         critic_loss = _mean(losses)
         _step(state.critic_optimizer, losses, combiner, noise.critic_order)
@@ -303,15 +303,11 @@ def update(
     with timer("targets"):
         if update_target:
             _move_target(state, hyperparameters.tau)
-        left_out = th.zeros(n_tasks, device=target.device)
-        if hyperparameters.max_task_loss is not None:
-            assert weight is not None
-            left_out = (weight == 0).float()
+        if noise.mixture is not None:
             for mixture in state.mixtures:  # only now: a backward pass needs what the forward pass saw
-                assert noise.mixture is not None
-                mixture.reinitialize_(weight > 0, noise.mixture)
+                mixture.reinitialize_(healthy, noise.mixture)
     q_value = th.cat([values.detach() for values in q]).reshape(n_tasks, -1).mean(dim=1)
-    return Metrics(actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value, left_out)
+    return Metrics(actor_loss, critic_loss, ent_coef_loss, ent_coef, q_value, (~healthy).float())
 
 
 def squashed_gaussian(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -366,13 +362,13 @@ def _step(
 @th.no_grad()
 def _task_weight(
     errors: Sequence[th.Tensor], ent_coef: th.Tensor, n_tasks: int, hyperparameters: Hyperparameters
-) -> th.Tensor | None:
-    """Return each task's weight in the losses, ``(n_tasks,)``; ``None`` where all weigh 1."""
+) -> tuple[th.Tensor, th.Tensor | None]:
+    """Return whether each task's loss is small enough, ``(n_tasks,)`` bool, and its weight, ``None`` if all are 1."""
     weight = temperature_weight(ent_coef) if hyperparameters.weight_by_temperature else None
     if hyperparameters.max_task_loss is None:
-        return weight
-    is_healthy = _per_task(errors, n_tasks) <= hyperparameters.max_task_loss
-    return is_healthy.float() if weight is None else weight * is_healthy
+        return th.ones(n_tasks, dtype=th.bool, device=ent_coef.device), weight
+    healthy = _per_task(errors, n_tasks) <= hyperparameters.max_task_loss
+    return healthy, healthy.float() if weight is None else weight * healthy
 
 
 def _per_task(errors: Sequence[th.Tensor], n_tasks: int) -> th.Tensor:

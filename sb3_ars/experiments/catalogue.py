@@ -71,7 +71,7 @@ def find_presets(words: Iterable[str]) -> list[str]:
     :raises ConfigError: if there is no such preset
     """
     names, found = preset_names(), preset_names()
-    for word in words:
+    for word in map(str.lower, words):
         fitting = [name for name in found if word in name]
         if not fitting:
             parts = sorted({part for name in found for part in name.split("-")})

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -117,6 +117,17 @@ class PolicyConfig:
     """Options of a critic_body of its own, such as update_period 10 of popart."""
 
     def __post_init__(self) -> None:
+        widths: Any = self.net_arch  # of whatever type a file gives
+        if not isinstance(widths, tuple):
+            raise ConfigError(f"policy.net_arch={widths!r} must be a list of widths, such as [400, 400].")
+        for width in self.net_arch:
+            check_count("policy.net_arch entry", width)
+        for option in ("body_options", "critic_body_options"):
+            options = getattr(self, option)
+            if options is not None and (not isinstance(options, Mapping) or "name" in options):
+                raise ConfigError(
+                    f"policy.{option}={options!r} must be a mapping of a body's options, its name not among them."
+                )
         if self.body_options and self.body == "plain":
             raise ConfigError(
                 f"policy.body_options={self.body_options} go with a body, but policy.body is plain; name one, such as "
@@ -135,6 +146,15 @@ class ScheduleConfig(SMTConfig):
 
     name: Literal["none", "smt"] = "none"
     """none: all tasks, always; smt: hard tasks first, with the options here."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given = [f.name for f in dataclasses.fields(self) if getattr(self, f.name) != f.default]
+        if self.name == "none" and given:
+            raise ConfigError(
+                f"schedule.{given[0]}={getattr(self, given[0])!r} goes with a schedule, but schedule.name is none; "
+                "name it smt, or drop the option."
+            )
 
 
 @dataclass(frozen=True)
@@ -223,6 +243,12 @@ def _build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
             raise ConfigError(
                 f"{where}: {key!r} is no option of {cls.__name__}; it has {', '.join(hints)}."
                 + nearest(str(key), hints)
+            )
+        if get_origin(hints[key]) is Literal and value not in get_args(hints[key]):
+            allowed = [str(choice) for choice in get_args(hints[key])]
+            raise ConfigError(
+                f"{where}: {key}={value!r} is unknown; choose one of {', '.join(allowed)}."
+                + nearest(str(value), allowed)
             )
         if dataclasses.is_dataclass(hints[key]):
             kwargs[key] = _build(hints[key], value or {}, where)

@@ -165,9 +165,14 @@ def body_config(options: Mapping[str, Any]) -> BodyConfig:
     :param options: ``{"name": "moore", "n_experts": 6}``; options not given have the paper's MT10 value
     :raises ConfigError: for an unknown name or option, or a value that cannot work
     """
+    if not isinstance(options, Mapping):
+        raise ConfigError(
+            f"body={options!r} must be a mapping of options, such as {{'name': 'moore'}}, or None."
+            + nearest(str(options), BODIES)
+        )
     given = dict(options)
     name = given.pop("name", None)
-    if name not in BODIES:
+    if not isinstance(name, str) or name not in BODIES:
         raise ConfigError(
             f"body name={name!r} is unknown; choose one of {list(BODIES)}." + nearest(str(name), BODIES)
         )
