@@ -389,8 +389,7 @@ def _toy_block(results: Results, page: str) -> str:
     for arm in (arm for arm in ARMS if arm in arms and arm in runs):
         found = summary(runs[arm])
         numbers = (*found["tasks"], found["mean"], found["lowest"])
-        rest = (f"{found['seconds']:.0f}", f"{found['seeds']}")
-        rows.append((arms[arm], *(f"{number:.2f}" for number in numbers), *rest))
+        rows.append((arms[arm], *(f"{number:.2f}" for number in numbers), f"{found['seeds']}"))
     scales = results["toy_methods"]["reward_scales"] if rows else ()
     tasks = (f"rewards to {scale:g}" for scale in scales)
     headings = (
@@ -398,7 +397,6 @@ def _toy_block(results: Results, page: str) -> str:
         *tasks,
         "mean",
         "lowest of any task and seed",
-        "seconds a run",
         "seeds",
     )
     return markdown_table(headings, rows) if rows else UNMEASURED

@@ -268,7 +268,7 @@ def _machine_number(machines: list[dict[str, Any]], own: dict[str, Any]) -> int:
 
 
 def summary(runs: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return an arm's success: mean of each task over seeds, of all tasks, lowest of any task and seed; and seconds.
+    """Return an arm's success: mean of each task over seeds, of all tasks, lowest of any task and seed.
 
     :param runs: seed -> what :func:`train_arm` returned
     """
@@ -279,7 +279,6 @@ def summary(runs: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "mean": float(success.mean()),
         "lowest": float(success.min()),
         "lowest_task": float(success.mean(axis=0).min()),
-        "seconds": float(np.median([run["seconds"] for run in runs.values()])),
     }
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import sb3_ars
+from benchmarks.toy_methods import summary
 
 ROOT = Path(sb3_ars.__file__).parent
 LAYER = {  # each may import those before it, and its own
@@ -199,15 +200,12 @@ def test_every_option_and_logged_number_is_documented():
 def measured_rows():
     """The README's rows of measured numbers, from the files the benchmarks wrote."""
     results = ROOT.parent / "benchmarks" / "results"
-    toy = json.loads((results / "toy_learning.json").read_text())
-    lowest = toy["lowest_over_seeds_and_tasks"]
-    mean = {arm: sum(map(sum, rows)) / sum(map(len, rows)) for arm, rows in toy["success"].items()}
-    quiet = max(max(success[2:]) for success in toy["success"]["sac"])
-    for arm, label in (
-        ("ars", f"toy tasks, {toy['seeds']} seeds, `ars`"),
-        ("ars-bf16", 'the same with `precision="bf16"`'),
-    ):
-        yield f"| {label} | mean success {mean[arm]:.2f}, lowest of any task and seed {lowest[arm]:.2f} |"
+    toy = json.loads((results / "toy_methods.json").read_text())["runs"]
+    for arm, label in (("ars", "`ars`"), ("ars-bf16", 'the same with `precision="bf16"`')):
+        found = summary(toy[arm])
+        label = f"toy tasks, {found['seeds']} seeds, {label}" if arm == "ars" else label
+        yield f"| {label} | mean success {found['mean']:.2f}, lowest of any task and seed {found['lowest']:.2f} |"
+    quiet = max(max(run["success"][2:]) for run in toy["sac"].values())
     yield f"| the same without scaling and resets | highest success of a quiet task in any seed: {quiet:.2f} |"
     for run in json.loads((results / "demo.json").read_text())["runs"]:
         minutes = run["training_seconds"] / 60
