@@ -34,7 +34,6 @@ def test_bf16_learns_every_toy_task_as_well(success):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
-def test_without_scaling_and_resets_the_quiet_tasks_stay_under_half_of_that(success, seed):
-    loud, quiet = success("sac", seed)[:2], success("sac", seed)[2:]
-    assert max(quiet) < 0.45 and np.mean(loud) > 0.8, success("sac", seed)
+def test_without_scaling_and_resets_the_quiet_tasks_stay_under_half_of_that(success):
+    loud, quiet = np.split(np.mean([success("sac", seed) for seed in SEEDS], axis=0), 2)
+    assert max(quiet) < 0.45 and min(loud) > 0.8, (loud, quiet)
