@@ -16,8 +16,7 @@ __all__ = ["MOORE", "orthonormal", "orthonormal_coefficients"]
 _RELATIVE_FLOOR = 1e-4
 _ABSOLUTE_FLOOR = 1e-6  # of any length, for experts that give zero
 
-
-_ROWS_AT_ONCE = 500  # on a CPU: the experts' outputs for more rows leave its caches
+_ROWS_AT_ONCE = 1000  # on a CPU: the experts' outputs for more rows leave its caches
 
 
 class MOORE(Body):
@@ -117,6 +116,6 @@ class _Gram(th.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: th.Tensor) -> th.Tensor:
         (vectors,) = ctx.saved_tensors
-        # dU = (G + G^t) U
-        of_rows: th.Tensor = (grad + grad.transpose(1, 2)) @ vectors.transpose(0, 1).double()
-        return of_rows.to(vectors.dtype).transpose(0, 1)
+        # dU = (G + G^t) U; a gradient needs no more than float32
+        of_rows: th.Tensor = (grad + grad.transpose(1, 2)).to(vectors.dtype) @ vectors.transpose(0, 1)
+        return of_rows.transpose(0, 1).contiguous()
