@@ -572,9 +572,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         env.set_active_tasks(indices)
         buffer.set_active_tasks(indices)
         self.active_tasks = indices
-        if (
-            self._stepping_env is not None
-        ):  # SB3 calls on_rollout_start with the rollout's environment in hand
+        # SB3 calls on_rollout_start with the rollout's environment in hand
+        if self._stepping_env is not None:
             self._stepping_env.num_envs = self._n_active_envs()
 
     def _n_active_envs(self) -> int:
@@ -977,7 +976,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         with self._seeded_by(self.n_resets + 1):
             policy.enable_lora(self.lora)
         self.policy_kwargs["lora"] = dict(self.lora)
-        self._lora_changed()
+        self.n_resets += 1
+        self._prepare_execution()
 
     def renew_lora(self) -> None:
         """Start the adapters afresh on their frozen base, with new moments in their optimizers; layer norms stay."""
@@ -986,11 +986,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             policy.renew_lora()
         for optimizer in (self.actor.optimizer, self.critic.optimizer):
             reset_optimizer_(optimizer)
-        self._lora_changed()
-
-    def _lora_changed(self) -> None:
         self.n_resets += 1
-        self._prepare_execution()
 
     def _reset_temperature(self) -> None:
         if self.log_ent_coef is None or self.ent_coef_optimizer is None:
