@@ -34,6 +34,7 @@ from sb3_ars.evaluation import (
 )
 from sb3_ars.experiments.config import Activation, BodyOptions, RunConfig, load_config, save_config
 from sb3_ars.experiments.plots import plot_training
+from sb3_ars.experiments.run_folder import FORMAT, RESULT, write_json
 from sb3_ars.profiling import PartTimer
 from sb3_ars.versions import run_versions
 
@@ -69,7 +70,13 @@ class RunResult:
     seconds_by_part: dict[str, float] | None = None
 
 
-def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
+def train(
+    config: RunConfig,
+    name: str,
+    progress_bar: bool = True,
+    folder: Path | None = None,
+    after_evaluation: BaseCallback | None = None,
+) -> RunResult:
     """Train as configured, evaluate, and write the run's folder.
 
     An interrupt (Ctrl-C) ends training early; what was learned is evaluated and saved like a finished run.
@@ -77,6 +84,9 @@ def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
     :param config: of the run
     :param name: of the preset, for the folder's name
     :param progress_bar: whether to show one
+    :param folder: of the run, new or empty; ``None`` makes one in ``config.output``, named after preset and seed
+    :param after_evaluation: called after each evaluation during training, which is its ``parent``; where its
+        ``on_step`` returns ``False`` training ends early
     :raises ConfigError: before training, if an option cannot work or the folder cannot be written
     """
     protocol = protocol_of(config)
@@ -84,14 +94,16 @@ def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
         raise ConfigError(
             f"algorithm.device={config.algorithm.device!r}, but torch finds no GPU here; use 'auto' or 'cpu'."
         )
-    folder = _make_folder(config, name)
+    folder = _make_folder(
+        _free_folder(config.output / f"{name}-seed{config.seed}") if folder is None else folder
+    )
     with ExitStack() as stack:
         stack.callback(_remove_if_unused, folder)
         env = stack.enter_context(closing(make_env(config)))
         model = build_model(config, env, verbose=1)
         evaluation_env = stack.enter_context(closing(_make_evaluation_env(config, protocol)))
         save_config(config, folder / "config.yaml")
-        _write_json(folder / "versions.json", run_versions())
+        write_json(folder / "versions.json", run_versions())
         model.set_logger(
             configure(str(folder), ["csv", "tensorboard", *(["stdout"] if config.verbose else [])])
         )
@@ -99,15 +111,18 @@ def train(config: RunConfig, name: str, progress_bar: bool = True) -> RunResult:
         started = time.monotonic()
         timer = PartTimer(model.device) if config.profile else None
         model.timer = timer or model.timer
-        interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar)
+        interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar, after_evaluation)
         seconds = time.monotonic() - started
         by_part = timer.seconds() if timer else None
         model.save(folder / "policy")
         evaluations = _evaluate_both(model, evaluation_env, protocol, progress_bar)
         table = final_table(evaluations, model.reward_scale.scale.tolist())
-        _write_result(folder, table, protocol, model, seconds, by_part, interrupted)
         names = list(evaluations[True].task_names)
         plot_training(folder / "progress.csv", names, model.reward_scale_history, folder / "training.png")
+        table.to_csv(folder / "evaluation.csv")
+        write_json(
+            folder / RESULT, _result(name, config, table, protocol, model, seconds, by_part, interrupted)
+        )
     return RunResult(folder, table, protocol.describe(), seconds, by_part)
 
 
@@ -239,6 +254,7 @@ def _learn(
     protocol: EvaluationProtocol,
     folder: Path,
     progress_bar: bool,
+    after_evaluation: BaseCallback | None,
 ) -> bool:
     """Train; return whether the user interrupted."""
     bar = ProgressBarCallback()
@@ -251,6 +267,7 @@ def _learn(
                 protocol,
                 best_model_save_path=folder,
                 log_path=folder,
+                callback_after_eval=after_evaluation,
             )
         )
     interrupted = False
@@ -296,51 +313,54 @@ def _evaluate_both(
     }
 
 
-def _write_result(
-    folder: Path,
+def _result(
+    name: str,
+    config: RunConfig,
     table: pd.DataFrame,
     protocol: EvaluationProtocol,
     model: MultiTaskOffPolicyAlgorithm,
     seconds: float,
     seconds_by_part: dict[str, float] | None,
     interrupted: bool,
-) -> None:
-    table.to_csv(folder / "evaluation.csv")
-    _write_json(
-        folder / "result.json",
-        {
-            "mean_success": float(table["success"].mean()),
-            "mean_success_sampled": float(table["success_sampled"].mean()),
-            "tasks": json.loads(table.to_json(orient="index")),
-            "protocol": protocol.describe(),
-            "timesteps": model.num_timesteps,
-            "updates": model._n_updates,
-            "resets": model.n_resets,
-            "reward_scale_history": model.reward_scale_history,
-            "training_seconds": round(seconds, 1),
-            "seconds_by_part": seconds_by_part,
-            "interrupted": interrupted,
-        },
-    )
+) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "name": name,
+        "seed": config.seed,
+        "mean_success": float(table["success"].mean()),
+        "mean_success_sampled": float(table["success_sampled"].mean()),
+        "tasks": json.loads(table.to_json(orient="index")),
+        "protocol": protocol.describe(),
+        "timesteps": model.num_timesteps,
+        "updates": model._n_updates,
+        "resets": model.n_resets,
+        "reward_scale_history": model.reward_scale_history,
+        "training_seconds": round(seconds, 1),
+        "seconds_by_part": seconds_by_part,
+        "interrupted": interrupted,
+    }
 
 
-def _make_folder(config: RunConfig, name: str) -> Path:
-    stem = config.output / f"{name}-seed{config.seed}"
+def _free_folder(stem: Path) -> Path:
+    """Return the path, or the first of it with a number behind that does not exist."""
     folder, number = stem, 2
     while folder.exists():
         folder, number = stem.with_name(f"{stem.name}-{number}"), number + 1
+    return folder
+
+
+def _make_folder(folder: Path) -> Path:
     try:
-        folder.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        occupied = any(folder.iterdir())
     except OSError as error:
         raise ConfigError(
             f"The run's folder {folder} cannot be made ({error.strerror}); choose another --output."
         ) from error
+    if occupied:
+        raise ConfigError(f"The run's folder {folder} is not empty; choose another, or delete it.")
     return folder
 
 
 def _task_list(tasks: str | tuple[str, ...]) -> str | list[str]:
     return tasks if isinstance(tasks, str) else list(tasks)
-
-
-def _write_json(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")

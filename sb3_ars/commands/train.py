@@ -1,0 +1,59 @@
+"""``sb3-ars train``: one run of a preset."""
+
+from __future__ import annotations
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from sb3_ars.commands.tables import print_evaluation
+from sb3_ars.experiments.config import load_preset
+from sb3_ars.profiling import PARTS
+
+__all__ = ["main"]
+
+_USAGE = """sb3-ars train PRESET [OPTIONS] trains a preset and evaluates it; 'sb3-ars list' shows the presets, and
+'sb3-ars train PRESET --help' a preset's options."""
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command; return its exit status.
+
+    :param arguments: behind the command's name
+    """
+    if not arguments or arguments[0].startswith("-"):
+        print(_USAGE)
+        return 0 if arguments and arguments[0] in ("-h", "--help") else 2
+    name, *rest = arguments
+    config = tyro.cli(
+        type(preset := load_preset(name)),
+        prog=f"sb3-ars train {name}",
+        description=f"Train the preset {name}; the defaults shown are the preset's.",
+        default=preset,
+        args=rest,
+    )
+    # after the options are read: it loads torch, and a mistake or --help should not wait for that
+    from sb3_ars.experiments.runner import train
+
+    print(
+        f"Training {name}: {config.algorithm.total_timesteps:,} environment steps. Ctrl-C ends it early and keeps it."
+    )
+    result = train(config, name)
+    print_evaluation(result.table, result.protocol)
+    if result.seconds_by_part is not None:
+        _print_profile(result.seconds_by_part)
+    print(f"Trained in {result.seconds / 60:.1f} minutes.")
+    for label, file in (("policy", "policy.zip"), ("picture", "training.png"), ("log", "progress.csv")):
+        print(f"  {label:8} {result.folder / file}")
+    print(f"  evaluate it again with: sb3-ars evaluate {result.folder}")
+    return 0
+
+
+def _print_profile(seconds_by_part: dict[str, float]) -> None:
+    total = sum(seconds_by_part.values())
+    table = Table("part", "what it is", box=None, title="Where the training time went", title_justify="left")
+    table.add_column("seconds", justify="right")
+    table.add_column("share", justify="right")
+    for part, seconds in seconds_by_part.items():
+        table.add_row(part, PARTS[part], f"{seconds:,.1f}", f"{seconds / total:.1%}")
+    Console().print(table)

@@ -1,0 +1,150 @@
+"""A run's folder on disk: what it holds and how a finished one is read; trains and draws nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from sb3_ars.errors import ConfigError
+from sb3_ars.experiments.config import RunConfig, load_config
+
+__all__ = ["FORMAT", "RESULT", "Run", "find_runs", "is_finished", "read_run", "write_json"]
+
+FORMAT = 1
+"""Version of the folder's layout; a change that an older reader would misread raises it."""
+
+RESULT = "result.json"
+"""Written last and whole: a folder with it holds a finished run."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, read from its folder.
+
+    :param folder: that it was read from
+    :param name: of the preset
+    :param config: the effective configuration
+    :param result: what ``result.json`` holds: ``mean_success``, ``tasks`` by name, ``reward_scale_history`` and more
+    :param versions: of the packages and the hardware it ran on
+    """
+
+    folder: Path
+    name: str
+    config: RunConfig
+    result: dict[str, Any]
+    versions: dict[str, Any]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.config.seed
+
+    @property
+    def task_names(self) -> tuple[str, ...]:
+        """The tasks, in order."""
+        return tuple(self.result["tasks"])
+
+    def success(self, sampled: bool = False) -> npt.NDArray[np.float64]:
+        """Return each task's final success rate, ``(n_tasks,)`` in [0, 1], NaN for a task that reports none.
+
+        :param sampled: of sampled instead of mean actions
+        """
+        key = "success_sampled" if sampled else "success"
+        values = [task[key] for task in self.result["tasks"].values()]
+        return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+    def progress(self) -> pd.DataFrame:
+        """Return the log, one row per write; the columns are the logger's keys.
+
+        :raises ConfigError: if ``progress.csv`` is missing or no table
+        """
+        try:
+            return pd.read_csv(self.folder / "progress.csv")
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{self.folder / 'progress.csv'} cannot be read: {error}") from error
+
+    def evaluations(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
+        """Return the evaluations during training, or ``None`` if the run made none.
+
+        :return: environment steps ``(n_evaluations,)`` and success rates ``(n_evaluations, n_tasks)`` in [0, 1]
+        """
+        path = self.folder / "evaluations.npz"
+        if not path.is_file():
+            return None
+        try:
+            with np.load(path) as arrays:
+                return arrays["timesteps"].astype(np.int64), arrays["successes"].mean(axis=2)
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise ConfigError(f"{path} cannot be read: {error}") from error
+
+
+def is_finished(folder: Path) -> bool:
+    """Return whether the folder holds a run that came to its end.
+
+    :param folder: of a run, which need not exist
+    """
+    return (folder / RESULT).is_file()
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """Return the folders of all finished runs in a folder and below it, sorted; itself if it is one.
+
+    :param folder: where to look
+    :raises ConfigError: if it does not exist
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is no folder; give the folder of a run, or one that holds runs.")
+    return sorted(path.parent for path in folder.rglob(RESULT))
+
+
+def read_run(folder: Path) -> Run:
+    """Return a finished run.
+
+    :param folder: of the run
+    :raises ConfigError: if the run did not finish, its files cannot be read, or another version of sb3_ars wrote it in
+        a form that this one does not know
+    """
+    if not is_finished(folder):
+        raise ConfigError(f"{folder} holds no finished run: there is no {RESULT}.")
+    result = _read_json(folder / RESULT)
+    if result.get("format") != FORMAT:
+        raise ConfigError(
+            f"{folder} has run format {result.get('format')!r}, but this version of sb3_ars reads format {FORMAT}; "
+            "read it with the version in its versions.json, or train it again."
+        )
+    missing = {"name", "mean_success", "tasks", "reward_scale_history", "timesteps"} - result.keys()
+    if missing:
+        raise ConfigError(f"{folder / RESULT} lacks {', '.join(sorted(missing))}; train the run again.")
+    config = load_config(folder / "config.yaml")
+    return Run(folder, result["name"], config, result, _read_json(folder / "versions.json"))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file whole or not at all.
+
+    :param path: file to write
+    :param value: anything JSON holds
+    """
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(value, indent=2) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}") from error
+    if not isinstance(value, dict):
+        raise ConfigError(f"{path} is not what a run writes: it holds no mapping.")
+    return value
