@@ -13,7 +13,6 @@ import argparse
 import dataclasses
 import inspect
 import json
-import math
 import os
 import sys
 import tempfile
@@ -28,21 +27,16 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import RESULTS, machine, threads_environment, write_result
-from sb3_ars.config import ARSConfig
 from sb3_ars.envs import make_toy_env
+from sb3_ars.envs.toy import TOY_TASKS
 from sb3_ars.experiments import preset_names
 from sb3_ars.experiments.config import RunConfig, load_preset
-from sb3_ars.nets.bodies import BODIES, body_config
-from sb3_ars.nets.lora import LoRAConfig
+from sb3_ars.experiments.scaling import load_scale, scaled
 
-TOTAL_TIMESTEPS = 24_000
-LEARNING_RATE = 1e-3  # with it, half of the preset toy's budget is enough
-EPISODES = 50
-QUIET = ("point-west", "point-south")  # the toy's hard tasks: their rewards are a hundredth of the loudest's
-AT_MOST = {  # sizes of the methods' own networks and schedules; counts of experts and parameter sets stay
-    "n_layers": 2, "module_width": 32, "gate_width": 64, "rank": 4, "pool_size": 2, "train_freq": 2,
-}  # fmt: skip
-WIDTH, LAYERS = 64, 2
+SCALE = load_scale("toy")
+TOTAL_TIMESTEPS = len(TOY_TASKS) * (SCALE.steps_per_task or 0)
+LEARNING_RATE = SCALE.options["algorithm"]["learning_rate"]
+EPISODES = SCALE.options["evaluation"]["n_episodes"]
 
 ARMS = {
     "sac": "mt10-sac",
@@ -66,76 +60,18 @@ ARMS = {
 
 
 def toy_config(preset: str, seed: int, total_timesteps: int = TOTAL_TIMESTEPS) -> RunConfig:
-    """Return a preset's method on the toy tasks, in the sizes of the preset ``toy``.
+    """Return a preset's method on the toy tasks: at the scale ``toy``, but with one reset for all that reset.
 
-    Taken over: the algorithm, gradient combiner, weighting, loss limit, adapters, schedule, reward scaling, what a
-    reset renews, bodies with their options and LayerNorm in the critics. Where the preset resets, whatever its number
-    of resets, there is one at a quarter of the run, as in ``toy``, and one where adapters start. A fixed scale for the
-    hard tasks goes to the quiet two.
+    It is at a quarter of the run, as in the preset ``toy``, with another where adapters start. Nothing is evaluated
+    during training.
 
     :param preset: any of :func:`~sb3_ars.experiments.preset_names`
     :param seed: of the run
     :param total_timesteps: environment steps, all four tasks together; with batches of the toy's size 1,600 or more
     """
-    method, toy = load_preset(preset), load_preset("toy")
-    algorithm = dataclasses.replace(
-        toy.algorithm,
-        algorithm=method.algorithm.algorithm,
-        total_timesteps=total_timesteps,
-        learning_rate=LEARNING_RATE,
-        train_freq=min(method.algorithm.train_freq, AT_MOST["train_freq"]),
-        execution="eager",  # the fastest for networks as small as these
-    )
-    policy = dataclasses.replace(
-        toy.policy,
-        net_arch=tuple(min(width, WIDTH) for width in method.policy.net_arch[:LAYERS]),
-        critic_layer_norm=method.policy.critic_layer_norm,
-        body=method.policy.body,
-        body_options=_body_options(method.policy.body, method.policy.body_options),
-        critic_body=method.policy.critic_body,
-        critic_body_options=_body_options(method.policy.critic_body, method.policy.critic_body_options),
-    )
-    schedule = method.schedule
-    if schedule.name != "none":
-        schedule = dataclasses.replace(
-            schedule,
-            pool_size=min(schedule.pool_size, AT_MOST["pool_size"]),
-            interval=max(1, total_timesteps // 24),  # ten episodes of each task in the pool, as on Meta-World
-        )
-    return dataclasses.replace(
-        toy,
-        seed=seed,
-        algorithm=algorithm,
-        ars=_ars(method, total_timesteps),
-        policy=policy,
-        schedule=schedule,
-        evaluation=dataclasses.replace(toy.evaluation, n_episodes=EPISODES),
-    )
-
-
-def _ars(method: RunConfig, total_timesteps: int) -> ARSConfig:
-    ars, times = method.ars, [total_timesteps // 4]
-    changes: dict[str, Any] = {"actor_value": "all", "updates_after_reset": total_timesteps // 24}
-    if isinstance(ars.reward_scaling, dict):
-        changes["reward_scaling"] = dict.fromkeys(QUIET, max(ars.reward_scaling.values()))
-    if ars.lora is not None:
-        lora = LoRAConfig.of(ars.lora)
-        # whatever the success: a short run shows the adapters or nothing
-        changes["lora"] = {**_reduced(dataclasses.asdict(lora)), "min_success": 0.0}
-        times.append(math.ceil(lora.start * total_timesteps))
-    if ars.reset_times(method.algorithm.total_timesteps, n_tasks=len(QUIET)):
-        changes |= {"n_reset": None, "param_resets": times}
-    return dataclasses.replace(ars, **changes)
-
-
-def _body_options(body: str, options: dict[str, Any] | None) -> dict[str, Any] | None:
-    if body not in BODIES:
-        return options
-    return _reduced(dataclasses.asdict(body_config({"name": body, **(options or {})})))
-
-
-def _reduced(options: dict[str, Any]) -> dict[str, Any]:
-    return {name: min(value, AT_MOST[name]) if name in AT_MOST else value for name, value in options.items()}
+    scale = dataclasses.replace(SCALE, resets_at=(0.25,), evaluations=0)
+    config = scaled(load_preset(preset), scale.lasting(total_timesteps // len(TOY_TASKS)))
+    return dataclasses.replace(config, seed=seed)
 
 
 # ---------------------------------------------------------------------- one run

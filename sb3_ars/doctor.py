@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,6 +9,8 @@ import numpy as np
 import psutil
 import torch as th
 
+from sb3_ars.envs.rendering import find_gl_backend
+from sb3_ars.errors import ConfigError
 from sb3_ars.versions import available_cpus, run_versions
 
 __all__ = ["Check", "run_checks"]
@@ -89,16 +88,7 @@ def _metaworld() -> Check:
 
 
 def _rendering() -> Check:
-    # in a process of its own: a missing GL library can abort the process, or fill the screen with warnings
-    script = (
-        "import mujoco\n"
-        "model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\"1\"/></worldbody></mujoco>')\n"
-        "mujoco.Renderer(model, 16, 16).render()"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
-    )
-    if done.returncode:
-        remedy = "install libegl1 or libosmesa6 and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
-        return Check("rendering", True, f"not available; training needs none. For videos {remedy}")
-    return Check("rendering", True, f"works (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'unset')})")
+    try:
+        return Check("rendering", True, f"works (MUJOCO_GL={find_gl_backend()})")
+    except ConfigError as error:
+        return Check("rendering", True, f"not available; training needs none. {error}")

@@ -27,6 +27,7 @@ __all__ = [
     "evaluate_tasks",
     "get_protocol",
     "make_evaluation_env",
+    "prepare_evaluation_env",
 ]
 
 Array = npt.NDArray[np.float64]
@@ -186,15 +187,9 @@ def _evaluate(
     seed: int,
     progress_bar: bool,
 ) -> TaskEvaluation:
-    check_evaluation_env(model, env, protocol)
+    prepare_evaluation_env(model, env, protocol)
     tasks: Any = env
     task_names, task_of_env = list(tasks.task_names), np.asarray(tasks.task_of_env)
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is not None:
-        normalizer.training = False
-        training_env: Any = getattr(model, "env", None)
-        if training_env is not None:
-            sync_envs_normalization(training_env, env)
     wanted = _episodes_of_env(task_of_env, len(task_names), protocol.n_episodes)
     episodes: list[list[dict[str, float]]] = [[] for _ in range(env.num_envs)]
     env.seed(seed)
@@ -229,6 +224,23 @@ def _outcome(info: dict[str, Any]) -> dict[str, float]:
         "returns": float(info["episode"]["r"]),
         "lengths": float(info["episode"]["l"]),
     }
+
+
+def prepare_evaluation_env(model: Any, env: VecEnv, protocol: EvaluationProtocol) -> None:
+    """Check an evaluation environment, and let it normalise observations as the training environment does now.
+
+    :param model: trained model
+    :param env: evaluation environment
+    :param protocol: its horizon and goals must be the environment's
+    :raises ConfigError: naming what does not fit and the remedy
+    """
+    check_evaluation_env(model, env, protocol)
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is not None:
+        normalizer.training = False
+        training_env: Any = getattr(model, "env", None)
+        if training_env is not None:
+            sync_envs_normalization(training_env, env)
 
 
 def check_evaluation_env(model: Any, env: VecEnv, protocol: EvaluationProtocol) -> None:

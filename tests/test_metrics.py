@@ -1,5 +1,8 @@
 """Summary numbers against hand-worked ones and an independent calculation."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -65,3 +68,26 @@ def test_scores_that_are_no_finite_table_are_refused(scores):
 def test_an_interval_needs_two_seeds():
     with pytest.raises(ConfigError, match="two seeds"):
         iqm_interval([[0.1, 0.2]])
+
+
+def test_iqm_cuts_whole_scores_only():
+    # a quarter of six scores is one and a half: one is cut at each end
+    assert iqm([5, 0, 1, 2, 3, 100]) == pytest.approx((1 + 2 + 3 + 5) / 4)
+
+
+RLIABLE = json.loads((Path(__file__).parent / "data" / "rliable.json").read_text())
+
+
+@pytest.mark.parametrize("case", RLIABLE["cases"])
+def test_iqm_and_its_interval_agree_with_rliable(case):
+    """Stored by tests/data/make_rliable.py, which says how to run it."""
+    theirs = RLIABLE["cases"][case]
+    scores = np.array(theirs["scores"])
+    ours = iqm_interval(scores, confidence=RLIABLE["confidence"], n_resamples=RLIABLE["n_resamples"], seed=3)
+    assert iqm(scores) == pytest.approx(theirs["iqm"], abs=1e-12)
+    assert ours.estimate == iqm(scores)
+    # what rates of ten episodes can move the mean by when one score inside the middle half changes by a step
+    step = 0.1 / (scores.size - 2 * int(0.25 * scores.size))
+    assert ours.low == pytest.approx(theirs["low"], abs=step + 1e-9)
+    assert ours.high == pytest.approx(theirs["high"], abs=step + 1e-9)
+    assert ours.low < ours.estimate < ours.high

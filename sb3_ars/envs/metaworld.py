@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from sb3_ars.envs.rendering import DEFAULT_CAMERA, MujocoCamera, select_gl_backend
 from sb3_ars.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -43,6 +44,8 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
     :param goal_stride: "ordered" goes on by this many goals
     :param render_mode: None, "rgb_array", "human" or "depth_array"
     :param fast: step through `fast_metaworld`, which gives the same numbers sooner; False is the stock env
+    :param render_size: width and height of rendered arrays in pixels
+    :param camera: "front", or one of the model's, such as "corner2" or "gripperPOV"
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # Gymnasium's is not a ClassVar
@@ -62,11 +65,15 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
         goal_stride: int = 1,
         render_mode: str | None = None,
         fast: bool = True,
+        render_size: int = 480,
+        camera: str = DEFAULT_CAMERA,
     ) -> None:
         self.task = task if task.endswith("-v3") else f"{task}-v3"
         self.goals = goals
         self.max_episode_steps = max_episode_steps
         self.render_mode = render_mode
+        self._render_size, self._camera_name = render_size, camera
+        self._camera: MujocoCamera | None = None
         self._stored = None if goals == "random" else _stored_goals(self.task, n_goals, goal_seed)
         self._first_goal, self._stride = first_goal, goal_stride
         self._next_goal = first_goal
@@ -124,11 +131,19 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
         return obs, float(reward), terminated, truncated, info
 
     def render(self) -> Any:
-        """Return what the simulator renders in ``render_mode``."""
-        return self.sawyer.render()
+        """Return the frame that ``render_mode`` asks for, or show it."""
+        if self.render_mode not in ("rgb_array", "depth_array"):
+            return self.sawyer.render()
+        if self._camera is None:
+            sawyer = self.sawyer
+            self._camera = MujocoCamera(sawyer.model, sawyer.data, self._camera_name, self._render_size)
+        return self._camera.draw(self.render_mode)
 
     def close(self) -> None:
         """Close the simulator and its windows."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
         self.sawyer.close()
 
     def _pick(self, n_goals: int) -> int:
@@ -153,6 +168,8 @@ def make_metaworld_env(
     worker_timeout: float = 30.0,
     render_mode: str | None = None,
     fast: bool = True,
+    render_size: int = 480,
+    camera: str = DEFAULT_CAMERA,
 ) -> MultiTaskVecEnv:
     """Return a VecEnv of Meta-World tasks: goals visible, rewards raw, one-hot task id in the observation.
 
@@ -170,7 +187,10 @@ def make_metaworld_env(
     :param worker_timeout: see `MultiTaskVecEnv`
     :param render_mode: None, "rgb_array", "human" or "depth_array"
     :param fast: see `MetaworldTask`
-    :raises ConfigError: if an option or a name cannot work; the message names it
+    :param render_size: see `MetaworldTask`
+    :param camera: see `MetaworldTask`
+    :raises ConfigError: if an option or a name cannot work, or nothing can draw what is to be rendered; the message
+        names it
     :raises ImportError: if Meta-World is not installed
     """
     # Here and not above: a worker imports this module, and needs neither SB3 nor torch.
@@ -187,6 +207,7 @@ def make_metaworld_env(
         raise ConfigError(f"goal_seed must be an integer from 0 to 2**32 - 1, got {goal_seed!r}.")
     if render_mode is not None:
         checks.check_choice("render_mode", render_mode, MetaworldTask.metadata["render_modes"])
+    checks.check_count("render_size", render_size, minimum=16)
     make = partial(
         MetaworldTask,
         goals=goals,
@@ -197,8 +218,12 @@ def make_metaworld_env(
         goal_stride=per_task,
         render_mode=render_mode,
         fast=fast,
+        render_size=render_size,
+        camera=camera,
     )
     names = metaworld_task_names(tasks)
+    if render_mode in ("rgb_array", "depth_array"):
+        select_gl_backend()
     env = MultiTaskVecEnv(
         [(name, [partial(make, name, first_goal=replica) for replica in range(per_task)]) for name in names],
         n_envs_per_task=per_task,

@@ -219,6 +219,8 @@ class MultiTaskVecEnv(VecEnv):
         self._with_task_id = np.zeros((n_envs, obs_dim + self.n_tasks), np.float32)
         self._with_task_id[np.arange(n_envs), obs_dim + self.task_of_env] = 1.0
         super().__init__(n_envs, task_id_space(spaces.low, spaces.high, self.n_tasks), spaces.action_space)
+        if self.render_mode is not None:
+            self.metadata["render_fps"] = self.get_attr("metadata", 0)[0].get("render_fps", 30)
 
     def _observations(self) -> npt.NDArray[np.float32]:
         observations: npt.NDArray[np.float32] = self._with_task_id.copy()

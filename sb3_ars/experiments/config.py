@@ -6,12 +6,15 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+import tyro
 import yaml
 
 from sb3_ars.config import ARSConfig, Execution, Precision
 from sb3_ars.core.schedule import SMTConfig
+from sb3_ars.envs.metaworld import metaworld_task_names
+from sb3_ars.envs.toy import TOY_TASKS
 from sb3_ars.errors import ConfigError, check_count, nearest
 from sb3_ars.experiments.catalogue import preset_values
 
@@ -22,9 +25,12 @@ __all__ = [
     "PolicyConfig",
     "RunConfig",
     "ScheduleConfig",
+    "build",
     "load_config",
     "load_preset",
+    "plain_values",
     "save_config",
+    "with_options",
 ]
 
 Activation = Literal["relu", "tanh"]
@@ -39,7 +45,7 @@ class EnvConfig:
     """The training environments."""
 
     tasks: str | tuple[str, ...] = "MT10"
-    """Meta-World benchmark ("MT10", "MT25", "MT50"), task names, or "toy"."""
+    """Meta-World benchmark ("MT10", "MT25", "MT50"), task names, "toy", or some of the toy's tasks by name."""
     n_envs_per_task: int = 1
     """Environments of each task that step together."""
     goals: Literal["random", "stored"] = "random"
@@ -48,6 +54,24 @@ class EnvConfig:
     """Horizon in steps."""
     n_workers: int | Literal["auto"] = "auto"
     """Worker processes; 0 steps in this process."""
+
+    @property
+    def is_toy(self) -> bool:
+        """Whether the tasks are the toy's."""
+        names = (self.tasks,) if isinstance(self.tasks, str) else self.tasks
+        return any(name in ("toy", *TOY_TASKS) for name in names)
+
+    @property
+    def task_names(self) -> tuple[str, ...]:
+        """The tasks by their full names, in order.
+
+        :raises ConfigError: for a name that no task has
+        """
+        if not self.is_toy:
+            return metaworld_task_names(self.tasks)
+        if self.tasks == "toy":
+            return TOY_TASKS
+        return (self.tasks,) if isinstance(self.tasks, str) else self.tasks
 
 
 @dataclass(frozen=True)
@@ -189,6 +213,8 @@ class RunConfig:
     """1 also prints SB3's log table."""
     profile: bool = False
     """Also print where the training time went, by part."""
+    scale: Annotated[str, tyro.conf.Suppress] = "full"
+    """Name of the scale that sized the run; see sb3_ars.experiments.scaling."""
     env: EnvConfig = field(default_factory=EnvConfig)
     algorithm: AlgorithmConfig = field(default_factory=AlgorithmConfig)
     ars: ARSConfig = field(default_factory=ARSConfig)
@@ -203,7 +229,7 @@ def load_preset(name: str) -> RunConfig:
     :param name: one of :func:`~sb3_ars.experiments.preset_names`
     :raises ConfigError: if there is none of that name, or its file holds an unknown key
     """
-    return _build(RunConfig, preset_values(name), f"preset {name!r}")
+    return build(RunConfig, preset_values(name), f"preset {name!r}")
 
 
 def load_config(path: Path) -> RunConfig:
@@ -220,7 +246,24 @@ def load_config(path: Path) -> RunConfig:
         raise ConfigError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(values, Mapping):
         raise ConfigError(f"{path} is not the configuration of a run.")
-    return _build(RunConfig, values, str(path))
+    return build(RunConfig, values, str(path))
+
+
+def with_options(config: RunConfig, options: Mapping[str, Any], where: str) -> RunConfig:
+    """Return the configuration with some options changed.
+
+    :param config: of the run
+    :param options: as in a preset: those of the run by name, and mappings of the parts' options
+    :param where: they come from, for messages
+    :raises ConfigError: for an unknown option, or a value that cannot work
+    """
+    values = _fields(config)
+    for key, value in options.items():
+        part = _fields(values[key]) if dataclasses.is_dataclass(values.get(key)) else None
+        values[key] = {**part, **value} if part is not None and isinstance(value, Mapping) else value
+    return build(
+        RunConfig, {k: _fields(v) if dataclasses.is_dataclass(v) else v for k, v in values.items()}, where
+    )
 
 
 def save_config(config: RunConfig, path: Path) -> None:
@@ -229,11 +272,26 @@ def save_config(config: RunConfig, path: Path) -> None:
     :param config: of the run
     :param path: file to write
     """
-    path.write_text(yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False), encoding="utf-8")
+    path.write_text(yaml.safe_dump(plain_values(config), sort_keys=False), encoding="utf-8")
 
 
-def _build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
-    """Make a nested dataclass of plain values; an unknown key is an error."""
+def plain_values(config: RunConfig) -> dict[str, Any]:
+    """Return a configuration as nested mappings of what YAML and JSON hold; :func:`build` reads it.
+
+    :param config: of the run
+    """
+    values: dict[str, Any] = _plain(dataclasses.asdict(config))
+    return values
+
+
+def build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
+    """Return a dataclass, nested ones included, of plain values.
+
+    :param cls: its class
+    :param values: fields by name; those not given have their defaults
+    :param where: they come from, for messages
+    :raises ConfigError: for an unknown key, or a value that cannot work
+    """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: {cls.__name__} must be a mapping of options, not {values!r}.")
     hints = get_type_hints(cls)
@@ -251,12 +309,16 @@ def _build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
                 + nearest(str(value), allowed)
             )
         if dataclasses.is_dataclass(hints[key]):
-            kwargs[key] = _build(hints[key], value or {}, where)
+            kwargs[key] = build(hints[key], value or {}, where)
         elif hints[key] is Path:
             kwargs[key] = Path(value)
         else:
             kwargs[key] = tuple(value) if isinstance(value, list) else value
     return cls(**kwargs)
+
+
+def _fields(config: Any) -> dict[str, Any]:
+    return {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
 
 
 def _plain(value: Any) -> Any:

@@ -96,12 +96,16 @@ def is_finished(folder: Path) -> bool:
 def find_runs(folder: Path) -> list[Path]:
     """Return the folders of all finished runs in a folder and below it, sorted; itself if it is one.
 
+    Runs that a sweep is still training are left out.
+
     :param folder: where to look
     :raises ConfigError: if it does not exist
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder} is no folder; give the folder of a run, or one that holds runs.")
-    return sorted(path.parent for path in folder.rglob(RESULT))
+    found = [path.parent for path in folder.rglob(RESULT)]
+    # a sweep renames the folder that a run is written in once the run is whole
+    return sorted(run for run in found if not any(part.endswith(".running") for part in run.parts))
 
 
 def read_run(folder: Path) -> Run:

@@ -43,6 +43,7 @@ __all__ = [
     "build_model",
     "evaluate_run",
     "final_table",
+    "load_policy",
     "make_env",
     "method_callbacks",
     "train",
@@ -145,20 +146,30 @@ def evaluate_run(
     )
     config = dataclasses.replace(config, evaluation=evaluation)
     chosen = protocol_of(config, own_horizon=protocol is None)
-    if not (folder / "policy.zip").is_file():
-        raise ConfigError(f"{folder} holds no policy.zip; the run did not finish.")
-    try:
-        model = _ALGORITHMS[config.algorithm.algorithm].load(folder / "policy.zip", device="auto")
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise ConfigError(
-            f"{folder / 'policy.zip'} cannot be read as {config.algorithm.algorithm}: {error}"
-        ) from error
+    model = load_policy(folder / "policy.zip", config)
     started = time.monotonic()
     with closing(_make_evaluation_env(config, chosen)) as env:
         evaluations = _evaluate_both(model, env, chosen, progress_bar)
     table = final_table(evaluations, model.reward_scale.scale.tolist())
     table.to_csv(folder / f"evaluation-{chosen.name}.csv")
     return RunResult(folder, table, chosen.describe(), time.monotonic() - started)
+
+
+def load_policy(path: Path, config: RunConfig, device: str = "auto") -> MultiTaskOffPolicyAlgorithm:
+    """Return the model that a run saved.
+
+    :param path: its ``policy.zip``
+    :param config: of the run
+    :param device: to load it to
+    :raises ConfigError: if it is missing or is not what the configuration trains
+    """
+    algorithm = config.algorithm.algorithm
+    if not path.is_file():
+        raise ConfigError(f"{path.parent} holds no {path.name}; the run did not finish.")
+    try:
+        return _ALGORITHMS[algorithm].load(path, device=device)
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ConfigError(f"{path} cannot be read as {algorithm}: {error}") from error
 
 
 def make_env(config: RunConfig) -> VecEnv:
@@ -170,8 +181,8 @@ def make_env(config: RunConfig) -> VecEnv:
         "max_episode_steps": env.max_episode_steps,
         "n_workers": env.n_workers,
     }
-    if env.tasks == "toy":
-        return make_toy_env(**common)
+    if env.is_toy:
+        return make_toy_env(tasks=env.task_names, **common)
     return make_metaworld_env(_task_list(env.tasks), goals=env.goals, **common)
 
 
@@ -227,7 +238,7 @@ def protocol_of(config: RunConfig, own_horizon: bool = True) -> EvaluationProtoc
     """
     protocol = get_protocol(config.evaluation.protocol)
     n_episodes = config.evaluation.n_episodes or protocol.n_episodes
-    if config.env.tasks == "toy":
+    if config.env.is_toy:
         return EvaluationProtocol("toy", n_episodes, config.env.max_episode_steps, goals=None)
     horizon = config.env.max_episode_steps if own_horizon else protocol.max_episode_steps
     changed = (n_episodes, horizon) != (protocol.n_episodes, protocol.max_episode_steps)
@@ -299,9 +310,10 @@ def _remove_if_unused(folder: Path) -> None:
 
 
 def _make_evaluation_env(config: RunConfig, protocol: EvaluationProtocol) -> VecEnv:
-    if config.env.tasks == "toy":
-        return make_toy_env(seed=config.seed, max_episode_steps=config.env.max_episode_steps)
-    return make_evaluation_env(_task_list(config.env.tasks), protocol, n_workers=config.env.n_workers)
+    env = config.env
+    if env.is_toy:
+        return make_toy_env(config.seed, max_episode_steps=env.max_episode_steps, tasks=env.task_names)
+    return make_evaluation_env(_task_list(env.tasks), protocol, n_workers=env.n_workers)
 
 
 def _evaluate_both(

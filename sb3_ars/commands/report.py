@@ -1,0 +1,36 @@
+"""``sb3-ars report``: tables and figures of runs as one HTML page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+__all__ = ["main"]
+
+
+@dataclass(frozen=True)
+class _ReportArguments:
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, or folders that hold runs."""
+    output: Path = Path("report")
+    """Folder of the report: index.html, and its tables as CSV and Markdown."""
+    sweeps: tuple[str, ...] = ()
+    """Tables and figures of the paper to show in their form, such as table1 fig5."""
+    videos: bool = False
+    """Put the runs' videos into the page."""
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command; return its exit status.
+
+    :param arguments: behind the command's name
+    """
+    options = tyro.cli(_ReportArguments, prog="sb3-ars report", args=arguments)
+    from sb3_ars.experiments.report import write_report  # after the options are read: it loads much
+
+    page = write_report(options.runs, options.output, options.sweeps, options.videos)
+    print(f"Report: {page}")
+    return 0
