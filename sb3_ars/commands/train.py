@@ -1,19 +1,21 @@
-"""``sb3-ars train``: one run of a preset."""
+"""``sb3-ars train``: one run of a preset, or of a configuration's file."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from sb3_ars.commands.tables import print_evaluation
-from sb3_ars.experiments.config import load_preset
+from sb3_ars.experiments.config import RunConfig, load_config, load_preset
 from sb3_ars.profiling import PARTS
 
 __all__ = ["main"]
 
 _USAGE = """sb3-ars train PRESET [OPTIONS] trains a preset and evaluates it; 'sb3-ars list' shows the presets, and
-'sb3-ars train PRESET --help' a preset's options."""
+'sb3-ars train PRESET --help' a preset's options. A run's config.yaml, or a study's best.yaml, may stand for PRESET."""
 
 
 def main(arguments: list[str]) -> int:
@@ -24,12 +26,15 @@ def main(arguments: list[str]) -> int:
     if not arguments or arguments[0].startswith("-"):
         print(_USAGE)
         return 0 if arguments and arguments[0] in ("-h", "--help") else 2
-    name, *rest = arguments
+    given, *rest = arguments
+    path = Path(given)
+    is_file = path.suffix in (".yaml", ".yml")
+    name = path.stem if is_file else given
     config = tyro.cli(
-        type(preset := load_preset(name)),
-        prog=f"sb3-ars train {name}",
-        description=f"Train the preset {name}; the defaults shown are the preset's.",
-        default=preset,
+        RunConfig,
+        prog=f"sb3-ars train {given}",
+        description=f"Train {given}; the defaults shown are its own.",
+        default=load_config(path) if is_file else load_preset(name),
         args=rest,
     )
     # after the options are read: it loads torch, and a mistake or --help should not wait for that

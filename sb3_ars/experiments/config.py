@@ -239,7 +239,7 @@ def load_config(path: Path) -> RunConfig:
     :raises ConfigError: if the file is missing, is no mapping, or holds an unknown key
     """
     if not path.is_file():
-        raise ConfigError(f"{path} does not exist; give the folder of a run, which holds config.yaml.")
+        raise ConfigError(f"{path} does not exist; the folder of a run holds one, config.yaml.")
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
