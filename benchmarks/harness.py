@@ -10,7 +10,6 @@ import gc
 import json
 import multiprocessing
 import os
-import platform
 import statistics
 import subprocess
 import time
@@ -23,7 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from sb3_ars.versions import available_cpus, run_versions
+from sb3_ars.versions import available_cpus, cpu_info, run_versions
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -291,17 +290,12 @@ def machine(cpus: int | None = None) -> dict[str, Any]:
     versions["packages"].update({name: _version(name) for name in PEERS})
     return {
         **versions,
-        "cpu_model": cpu_model(),
+        "cpu_model": versions["processor"],
         "cpu_flags": _cpu_flags(),
         "cpus_used": min(cpus or available_cpus(), available_cpus()),
         "tree_is_dirty": _tree_is_dirty(),
         "date": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     }
-
-
-def cpu_model() -> str:
-    """Return the processor's name as the system has it."""
-    return _cpuinfo("model name") or platform.processor() or platform.machine()
 
 
 def write_result(name: str, result: dict[str, Any], folder: Path = RESULTS) -> Path:
@@ -335,17 +329,9 @@ def _rounded(value: Any) -> Any:
     return value
 
 
-def _cpuinfo(key: str) -> str | None:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return None
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), None)
-
-
 def _cpu_flags() -> list[str]:
     """Return what of the processor decides how fast a matrix product can be."""
-    flags = (_cpuinfo("flags") or "").split()
+    flags = (cpu_info("flags") or "").split()
     return [flag for flag in CPU_FLAGS if flag in flags]
 
 

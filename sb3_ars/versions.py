@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import torch as th
 
-__all__ = ["PACKAGES", "available_cpus", "run_versions"]
+__all__ = ["PACKAGES", "available_cpus", "cpu_info", "run_versions"]
 
 PACKAGES = (
     "sb3-ars",
@@ -30,7 +30,7 @@ def run_versions() -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "processor": platform.processor() or platform.machine(),
+        "processor": cpu_info("model name") or platform.processor() or platform.machine(),
         "cpus": available_cpus(),
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
@@ -46,6 +46,18 @@ def available_cpus() -> int:
         if hasattr(psutil.Process, "cpu_affinity")
         else psutil.cpu_count() or 1
     )
+
+
+def cpu_info(key: str) -> str | None:
+    """Return what Linux says of the first processor, ``None`` elsewhere.
+
+    :param key: such as "model name" or "flags"
+    """
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return None
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), None)
 
 
 def _commit() -> str | None:
