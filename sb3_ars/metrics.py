@@ -58,7 +58,7 @@ def bottom_k(success: npt.ArrayLike, k: int) -> float:
 
 
 def estr(success: npt.ArrayLike, threshold: float) -> float:
-    """Return the share of tasks whose success reaches the threshold: |{i : success_i >= delta}| / N.
+    """Return the share of tasks whose success reaches the threshold: ``|{i : success_i >= delta}| / N``.
 
     :param success: ``(n_tasks,)`` final success rates in [0, 1]
     :param threshold: delta, in [0, 1]
