@@ -409,6 +409,12 @@ BOX = gym.spaces.Box(-1, 1, (1,))
             lambda: MultiTaskVecEnv({"a": lambda: gym.wrappers.NormalizeReward(Script(ONCE))}),
             "needs raw rewards",
         ),
+        (
+            lambda: MultiTaskVecEnv(
+                {"a": lambda: type("Mine", (gym.wrappers.NormalizeReward,), {})(Script(ONCE))}
+            ),
+            "NormalizeReward.*needs raw rewards",
+        ),
         (lambda: toy(n_envs_per_task=0), "n_envs_per_task=0 must be an integer of at least 1"),
         (lambda: toy(n_envs_per_task=1.0), "n_envs_per_task=.*must be an integer"),
         (lambda: toy(n_envs_per_task=True), "n_envs_per_task=.*must be an integer"),

@@ -489,32 +489,9 @@ def test_steps_are_read_from_the_log(tmp_path):
     assert _steps(tmp_path) == 0
 
 
-# ---------------------------------------------------------------------- the page
-
-PAGE = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()
-
-
-def blocks(language):
-    return [block.split("```")[0] for block in PAGE.split(f"```{language}\n")[1:]]
-
-
-def test_the_pages_commands_work(capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    commands = [line.split("#")[0].split() for block in blocks("sh") for line in block.splitlines()]
-    assert len(commands) == 4
-    for _, *arguments in commands:
-        dry = [*arguments, "--dry-run"] if len(arguments) > 1 else arguments
-        assert main(dry) == 0
-        assert "table1" in (out := capsys.readouterr().out) or "missing" in out
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_pages_examples_work(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for code in blocks("python"):
-        exec(code, {})
-    assert capsys.readouterr().out.count("missing") == 6
-    (table,) = blocks("yaml")
+def test_the_pages_table_can_be_loaded_and_names_every_kind(tmp_path):
+    page = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()
+    (table,) = [block.split("```")[0] for block in page.split("```yaml\n")[1:]]
     (tmp_path / "mine.yaml").write_text(table)
-    assert len(load_sweep("mine.yaml").rows) == 2
-    assert all(f"`{kind}`" in PAGE for kind in KINDS)
+    assert len(load_sweep(str(tmp_path / "mine.yaml")).rows) == 2
+    assert all(f"`{kind}`" in page for kind in KINDS)

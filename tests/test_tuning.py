@@ -631,17 +631,6 @@ def test_the_command_has_readable_help(capsys, monkeypatch):
         assert name in out
 
 
-def test_the_documented_example_of_a_study_of_ones_own_runs(tmp_path, monkeypatch):
-    page = (ROOT / "docs" / "tuning.md").read_text()
-    (code,) = [block.split("```")[0] for block in page.split("```python\n")[1:]]
-    trained = fake_train(monkeypatch, by_resets)
-    monkeypatch.chdir(tmp_path)
-    namespace = {}
-    exec(code, namespace)
-    assert len(namespace["study"].trials) == 10 and trained
-    assert namespace["study"].best_trial.user_attrs["runs"]
-
-
 def test_a_journal_that_is_none_is_refused(tmp_path):
     path = tmp_path / "journal.log"
     path.write_text("this is no journal\nat all\n")

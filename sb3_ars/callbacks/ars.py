@@ -60,11 +60,11 @@ class ARSCallback(BaseCallback):
         if not times:
             return
         if times[0] <= model.learning_starts or len(set(times)) < len(times):
-            option = "n_reset" if model.param_resets is None else "param_resets"
+            option, never = ("n_reset", "0") if model.param_resets is None else ("param_resets", "[]")
             raise ConfigError(
                 f"{option} asks for {len(times)} resets in {model._total_timesteps} steps, the first at step "
                 f"{times[0]}, but the random phase alone takes {model.learning_starts} steps (learning_starts). "
-                f"Train longer, reset less often ({option}=0 or [] for never), or set learning_starts."
+                f"Train longer, reset less often ({option}={never} for never), or set learning_starts."
             )
         if times[-1] >= model._total_timesteps:
             warnings.warn(

@@ -735,9 +735,9 @@ def _dumps(value: Any) -> bytes:
 
 
 def _facts(env: gym.Env[Any, Any]) -> EnvFacts:
-    normalizers = [
-        type(layer).__name__ for layer in _layers(env) if type(layer).__name__ in REWARD_NORMALIZERS
-    ]
+    # by name, so that nothing need be imported; a user's own kind of a normaliser is one too
+    classes = (cls.__name__ for layer in _layers(env) for cls in type(layer).__mro__)
+    normalizers = [name for name in classes if name in REWARD_NORMALIZERS]
     return EnvFacts(
         env.observation_space,
         env.action_space,

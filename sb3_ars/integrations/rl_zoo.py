@@ -165,33 +165,11 @@ def _one_task_each(plain: Any, scores_success: bool, env_fns: list[Any], **optio
     return _Tasks(venv, task_of_env, names, scores_success)
 
 
-class _ToWatch:
-    """Loads a model to watch it, without what RL Zoo 2.9 (enjoy.py) replaces in it for old versions of Python.
-
-    :param algorithm: whose model it is
-    """
-
-    def __init__(self, algorithm: type[MultiTaskOffPolicyAlgorithm]) -> None:
-        self._algorithm = algorithm
-
-    def load(
-        self, path: str, custom_objects: dict[str, Any] | None = None, **options: Any
-    ) -> MultiTaskOffPolicyAlgorithm:
-        """Return the model; its learning rate stays positive, as our algorithms demand.
-
-        :param path: of the zip
-        :param custom_objects: ignored
-        :param options: SB3's
-        """
-        return self._algorithm.load(path, **options)
-
-
 for _name, _algorithm in ALGORITHMS.items():
     ALGOS[_name] = _algorithm
     HYPERPARAMS_SAMPLER[_name] = sample_options
     HYPERPARAMS_CONVERTER[_name] = convert_offpolicy_params
 rl_zoo3.train.ExperimentManager = MultiTaskExperimentManager
-rl_zoo3.enjoy.ALGOS = {**ALGOS, **{_name: _ToWatch(_algorithm) for _name, _algorithm in ALGORITHMS.items()}}
 
 if __name__ == "__main__":
     try:
