@@ -61,8 +61,8 @@ $(BENCH_READY): $(READY)
 	@touch $(BENCH_READY)
 
 $(SERVICES_READY): $(READY)
-	@echo "Adding Ray and the PostgreSQL driver: about 80 MB of downloads the first time."
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,ray,postgres]"
+	@echo "Adding Ray: about 70 MB of downloads the first time."
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,ray]"
 	@touch $(SERVICES_READY)
 
 clean:

@@ -20,9 +20,11 @@ from benchmarks import memory, methods
 from benchmarks.harness import RESULTS, ROOT, markdown_table
 from benchmarks.toy_methods import ARMS, summary
 
-PERFORMANCE, METHODS_PAGE = ROOT / "docs" / "performance.md", ROOT / "docs" / "methods.md"
+PERFORMANCE, METHODS_PAGE, TUNING = (
+    ROOT / "docs" / f"{name}.md" for name in ("performance", "methods", "tuning")
+)
 METHOD_PAGES = METHODS_PAGE.with_suffix("")  # a folder
-PAGES = (PERFORMANCE, METHODS_PAGE, *sorted(METHOD_PAGES.glob("*.md")))
+PAGES = (PERFORMANCE, METHODS_PAGE, TUNING, *sorted(METHOD_PAGES.glob("*.md")))
 CHART = "performance.png"
 UNMEASURED = "Not measured yet."
 _BLOCK = re.compile(r"(<!-- begin: (?P<name>[\w-]+) -->\n).*?(<!-- end: (?P=name) -->)", re.DOTALL)
@@ -206,10 +208,11 @@ PANELS: dict[str, Callable[[dict[str, Any]], list[Panel]]] = {
 def render(name: str, results: Results) -> str:
     """Return the text of a block.
 
-    :param name: of ``BLOCKS``, of ``METHOD_BLOCKS``, a benchmark's, or "toy-" or "cost-" and a method's page
+    :param name: of ``BLOCKS``, ``METHOD_BLOCKS`` or ``TUNING_BLOCKS``, a benchmark's, or "toy-" or "cost-" and a
+        method's page
     :param results: name of a benchmark -> its JSON file
     """
-    blocks = BLOCKS | METHOD_BLOCKS
+    blocks = BLOCKS | METHOD_BLOCKS | TUNING_BLOCKS
     if name in blocks:
         return blocks[name](results)
     kind, _, page = name.partition("-")
@@ -437,8 +440,45 @@ def _cost_block(results: Results, page: str) -> str:
     return markdown_table(headings, rows) if rows else UNMEASURED
 
 
+# ---------------------------------------------------------------------- the study
+
+
+def _tuning_block(results: Results) -> str:
+    """Return what a study found of each options, its verdict, and what happened while it ran."""
+    if "tune_toy" not in results:
+        return UNMEASURED
+    result = results["tune_toy"]
+    names = list(result["space"])
+    rows = [
+        (
+            *(str(tried["params"][name]) for name in names),
+            f"{tried['mean']:.3f}",
+            f"{tried['std']:.3f}" if len(tried["values"]) > 1 else "-",
+            str(len(tried["values"])),
+        )
+        for tried in result["tried"]
+    ]
+    headings = (*(name.rpartition(".")[2] for name in names), "mean success", "std over runs", "runs")
+    story, killed = result["story"], result["story"]["killed_trial"]
+    told = (
+        f"Preset `{result['preset']}` at scale `{result['scale']}`, {result['steps']:,} environment steps a run, "
+        f"{result['seeds']} runs a trial, pruner `{result['pruner']}`. {story['processes']} processes brought "
+        f"{result['states']['complete']} trials to their end in {story['seconds'] / 60:.0f} minutes."
+    )
+    if killed is not None:
+        again = [str(trial["number"]) for trial in result["trials"] if trial["retry_of"] == killed]
+        tried_again = (
+            f"its options were tried again in trial {again[0]}"
+            if again
+            else "its options were not tried again"
+        )
+        told += f" The process that ran trial {killed} was killed in the middle; {tried_again}."
+    return "\n\n".join((told, markdown_table(headings, rows), result["verdict"]))
+
+
 SPEED = (*PANELS, "gpu_mt10")
 COMPARED = ("toy_methods", "methods")
+STUDIES = ("tune_toy",)
 
 BLOCKS: dict[str, Callable[[Results], str]] = {
     "machine": partial(_machine_block, names=SPEED),
@@ -454,6 +494,12 @@ METHOD_BLOCKS: dict[str, Callable[[Results], str]] = {
 }
 """Of the page that compares the methods."""
 
+TUNING_BLOCKS: dict[str, Callable[[Results], str]] = {
+    "tuning": _tuning_block,
+    "tuning-machine": partial(_machine_block, names=STUDIES),
+}
+"""Of the page on tuning."""
+
 PAGE_BLOCKS: dict[str, Callable[[Results, str], str]] = {"toy": _toy_block, "cost": _cost_block}
 """Of the methods' own pages."""
 
@@ -466,7 +512,7 @@ def read_results(folder: Path = RESULTS) -> Results:
 
     :param folder: where they are
     """
-    paths = {name: folder / f"{name}.json" for name in (*SPEED, *COMPARED)}
+    paths = {name: folder / f"{name}.json" for name in (*SPEED, *COMPARED, *STUDIES)}
     return {
         name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.is_file()
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from sb3_ars.envs.rendering import DEFAULT_CAMERA
 from sb3_ars.envs.toy import TOY_TASKS
 from sb3_ars.errors import ConfigError, check_count, nearest
 from sb3_ars.evaluation import EvaluationProtocol, Policy, make_evaluation_env, prepare_evaluation_env
-from sb3_ars.experiments.run_folder import read_run
+from sb3_ars.experiments.run_folder import read_run, write_whole
 from sb3_ars.experiments.runner import load_policy, protocol_of
 
 __all__ = ["Recording", "VideoFormat", "record", "record_episodes", "record_run", "write_video"]
@@ -91,7 +90,7 @@ def record_episodes(
     :param size: width and height of the frames in pixels
     :param camera: "front", or one of Meta-World's: "corner", "corner2", "corner3", "corner4", "topview",
         "behindGripper", "gripperPOV"
-    :param fps: most frames per second; steps in between are left out, and time runs as in the environment
+    :param fps: at most so many frames per second of the environment's time; steps in between are left out
     :param caption: whether the frames say task, step and success
     :raises ConfigError: for an unknown task, an environment that does not render, or a machine that cannot draw
     """
@@ -128,8 +127,8 @@ def record_run(
     :param deterministic: mean actions, or samples
     :param seed: of actions and environment
     :param size: in pixels
-    :param camera: name
-    :param fps: at most
+    :param camera: of Meta-World; the toy tasks have one view only
+    :param fps: at most so many frames per second of the environment's time
     :param after_task: told of each file as soon as it is written
     :return: the files
     :raises ConfigError: if the folder holds no finished run, for an unknown task, or where a file cannot be written
@@ -143,6 +142,7 @@ def record_run(
     rendering: dict[str, Any] = {"render_mode": "rgb_array", "render_size": _check_size(size)}
     config = run.config.env
     if config.is_toy:
+        _check_toy_camera(camera)
         env: VecEnv = make_toy_env(
             run.seed, max_episode_steps=config.max_episode_steps, tasks=config.task_names, **rendering
         )
@@ -173,15 +173,12 @@ def write_video(path: Path | str, frames: Frames, fps: float) -> Path:
         raise ConfigError(
             f"frames must be (n, height, width, 3) uint8, at least one, got {frames.shape} {frames.dtype}."
         )
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    write = _write_gif if path.suffix == ".gif" else _write_mp4
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, fps)
-        temporary.replace(path)
+        write_whole(path, lambda temporary: write(temporary, frames, fps))
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True) if temporary.parent.is_dir() else None
     return path
 
 
@@ -199,7 +196,7 @@ def _record(
         raise ConfigError(
             f"The environment has render_mode={env.render_mode!r}; make it with render_mode='rgb_array' to record it."
         )
-    for option, value in (("n_episodes", n_episodes), ("fps", fps)):
+    for option, value in (("n_episodes (--episodes)", n_episodes), ("fps", fps)):
         check_count(option, value)
     tasks: Any = env
     horizon, goals = getattr(env, "max_episode_steps", None), getattr(env, "goals", None)
@@ -292,6 +289,10 @@ def _imageio() -> Any:
 def _format_of(given: VideoFormat | None, output: Path | None) -> VideoFormat:
     """Return the format; raise while nothing is recorded yet if it cannot be written."""
     suffix = None if output is None else output.suffix.removeprefix(".")
+    if suffix == "":
+        raise ConfigError(
+            f"{output} needs a suffix, .mp4 or .gif: it is the file of one task (--task all takes a folder)."
+        )
     chosen: Any = given or suffix or "mp4"
     if chosen not in get_args(VideoFormat) or suffix not in (None, chosen):
         where = "" if output is None else f" for {output}"
@@ -326,6 +327,7 @@ def _task_index(task: str | int, names: Sequence[str]) -> int:
 def _make_env(names: Sequence[str], n_episodes: int, size: int, camera: str) -> VecEnv:
     rendering: dict[str, Any] = {"render_mode": "rgb_array", "render_size": _check_size(size)}
     if set(names) <= set(TOY_TASKS):
+        _check_toy_camera(camera)
         return make_toy_env(seed=0, tasks=list(names), **rendering)
     known = metaworld_task_names("MT50")
     if not set(names) <= set(known):
@@ -335,6 +337,13 @@ def _make_env(names: Sequence[str], n_episodes: int, size: int, camera: str) -> 
         )
     rendering["camera"] = camera
     return make_metaworld_env(list(names), seed=0, goals="ordered", n_workers=0, **rendering)
+
+
+def _check_toy_camera(camera: str) -> None:
+    if camera != DEFAULT_CAMERA:
+        raise ConfigError(
+            f"camera={camera!r} is for Meta-World; the toy tasks are drawn from one side only, so leave --camera out."
+        )
 
 
 def _check_size(size: int) -> int:

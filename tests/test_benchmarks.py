@@ -206,6 +206,37 @@ def test_the_methods_pages_have_their_tables():
             assert f"<!-- begin: {kind}-{method.page} -->" in page, (kind, method.page)
 
 
+def test_the_page_on_tuning_has_its_blocks():
+    page = report.TUNING.read_text()
+    for name in report.TUNING_BLOCKS:
+        assert f"<!-- begin: {name} -->" in page, name
+
+
+def test_a_study_is_told_with_its_kill_and_its_verdict():
+    study = {
+        "preset": "mt10-ars", "scale": "toy", "steps": 24_000, "seeds": 2, "pruner": "none", "verdict": "No more.",
+        "space": {"ars.n_reset": {"type": "int", "low": 0, "high": 9}},
+        "story": {"processes": 2, "killed_trial": 5, "seconds": 660.0},
+        "states": {"complete": 12},
+        "tried": [
+            {"params": {"ars.n_reset": 4}, "mean": 0.9, "std": 0.14142, "values": [0.8, 1.0]},
+            {"params": {"ars.n_reset": 0}, "mean": 0.25, "std": None, "values": [0.25]},
+        ],
+        "trials": [{"number": 5, "retry_of": None}, {"number": 8, "retry_of": 5}],
+    }  # fmt: skip
+    told = report.render("tuning", {"tune_toy": study})
+    assert (
+        "24,000 environment steps a run, 2 runs a trial" in told
+        and "12 trials to their end in 11 minutes" in told
+    )
+    assert "| 4 | 0.900 | 0.141 | 2 |" in told and "| 0 | 0.250 | - | 1 |" in told
+    assert "trial 5 was killed in the middle; its options were tried again in trial 8." in told
+    assert told.endswith("\n\nNo more.")
+    study["story"]["killed_trial"] = None
+    assert "killed" not in report.render("tuning", {"tune_toy": study})
+    assert report.render("tuning", {}) == report.UNMEASURED
+
+
 def test_the_table_of_methods_has_every_arm_and_every_timed_network_once():
     arms = [arm for method in report.METHODS for arm in (method.alone, method.with_ars) if arm]
     assert sorted(arms) == sorted(toy_methods.ARMS)

@@ -15,6 +15,7 @@ from sb3_ars.cli import main
 from sb3_ars.errors import ConfigError, WorkerError
 from sb3_ars.experiments import runner
 from sb3_ars.experiments.config import RunConfig, ScheduleConfig, load_config, load_preset, save_config
+from sb3_ars.experiments.run_folder import write_json, write_whole
 from sb3_ars.experiments.runner import build_model, train
 
 
@@ -174,6 +175,43 @@ def test_the_command_line_builds_the_same_configuration_as_a_file(
 
 def stop():
     raise StopIteration
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+    path, asked = tmp_path / "policy.zip", []
+
+    def torn(temporary):
+        asked.append(temporary)
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+
+    write_whole(path, lambda temporary: temporary.write_text("whole") and None)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(path, torn)
+    assert path.read_text() == "whole" and list(tmp_path.iterdir()) == [path]
+    # writers such as torch, matplotlib and imageio go by the suffix
+    assert asked[0].suffix == ".zip" and asked[0].parent == tmp_path and asked[0] != path
+
+
+def test_a_folder_is_written_whole_or_not_at_all(tmp_path):
+    def torn(temporary):
+        temporary.mkdir()
+        (temporary / "half").write_text("")
+        raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        write_whole(tmp_path / "folder", torn)
+    assert not list(tmp_path.iterdir())
+    write_whole(tmp_path / "folder", lambda temporary: temporary.mkdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_json_that_cannot_be_written_leaves_the_old_file(tmp_path):
+    write_json(tmp_path / "result.json", {"seed": 1})
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "result.json", {"seed": object()})
+    assert json.loads((tmp_path / "result.json").read_text()) == {"seed": 1}
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_broken_run_folders_are_refused_by_name(tmp_path, capsys):

@@ -300,7 +300,7 @@ for words in {commands!r}:
 
 def test_rl_zoo_trains_tunes_and_watches(tmp_path):
     pytest.importorskip("rl_zoo3", reason="extra 'zoo' is missing")
-    (block,) = examples("bash", "RL Zoo")
+    (block,) = examples("sh", "RL Zoo")
     short = {
         "train": "-n 800 --eval-freq 400 -params updates_after_reset:2 --seed 1",
         "enjoy": "-n 120 --exp-id 1",
@@ -315,14 +315,29 @@ def test_rl_zoo_trains_tunes_and_watches(tmp_path):
         [*toy, "arstqc", "-params", "updates_after_reset:2"],
         [*toy, "arssac", "-params", "n_envs:6"],
         [*toy, "arssac", "-params", "normalize:True"],
+        [
+            "zoo",
+            "tune",
+            *toy[2:4],
+            "-n",
+            "120",
+            "--algo",
+            "arssac",
+            "--n-trials",
+            "1",
+            "--no-optim-plots",
+            "--seed",
+            "1",
+        ],
         ["zoo", "trian"],
     ]
     out = python(ZOO.format(commands=commands), tmp_path)
-    trained, watched, tuned, of_tqc, refused, normalized, unknown = out.split("RUN ")[1:]
+    trained, watched, tuned, of_tqc, refused, normalized, none, unknown = out.split("RUN ")[1:]
     assert "REFUSED" not in trained + watched + tuned + of_tqc
     assert "Success rate: " in trained and "'n_envs', 4" in trained
     assert "Success rate: " in watched and "Episodes" in watched
     assert "n_envs=6 cannot be shared out evenly among the 4 tasks" in refused
+    assert "REFUSED No trial of the study came to its end" in none
     assert "VecNormalize(norm_reward=True)" in normalized and "Did you mean 'train'?" in unknown
     folder = tmp_path / "logs" / "arssac" / "sb3_ars-toy-v0_1"
     assert (folder / "best_model.zip").is_file() and (folder / "evaluations.npz").is_file()
@@ -343,6 +358,13 @@ def test_rl_zoo_trains_tunes_and_watches(tmp_path):
     assert [trial.state.name for trial in trials] == ["COMPLETE"] * 2
     for trial in trials:
         assert 0 <= trial.value <= 1 and "n_reset" in trial.params  # success, not a return
+
+
+def test_rl_zoo_s_command_exits_as_ours_do():
+    pytest.importorskip("rl_zoo3", reason="extra 'zoo' is missing")
+    command = [sys.executable, "-m", "sb3_ars.integrations.rl_zoo", "trian"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith("error: 'trian' is none of train")
 
 
 def test_the_shipped_hyperparameters_are_those_of_the_registered_ids():

@@ -12,7 +12,19 @@ nbclient = pytest.importorskip("nbclient", reason='nbclient is missing: pip inst
 pytest.importorskip("ipykernel", reason='ipykernel is missing: pip install "sb3-ars[notebooks]"')
 
 ROOT = Path(sb3_ars.__file__).parents[1]
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb"))
+NAMES = (
+    "01_quickstart",
+    "02_why_rewards_must_be_scaled",
+    "03_ars_on_metaworld",
+    "04_tuning_n_reset",
+    "05_your_own_tasks",
+    "06_reading_a_sweep",
+)
+NOTEBOOKS = [ROOT / "notebooks" / f"{name}.ipynb" for name in NAMES]
+
+
+def test_every_notebook_is_run():
+    assert tuple(sorted(path.stem for path in (ROOT / "notebooks").glob("*.ipynb"))) == NAMES
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

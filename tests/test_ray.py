@@ -65,7 +65,13 @@ def cells_on(node):
 
 class Noting(Silent):
     def __init__(self):
-        self.names = []
+        self.names, self.n_ready = [], 0
+
+    def ready(self):
+        self.n_ready += 1
+
+    def started(self, cell):
+        raise AssertionError("a cell that only waits does not look started")
 
     def ended(self, outcome):
         self.names.append(outcome.cell.name)
@@ -90,6 +96,7 @@ def test_every_cell_is_finished_once_though_a_node_is_killed(cluster, tmp_path):
     assert killed and not any(process.is_running() for process in killed)
     assert [outcome.status for outcome in outcomes] == ["finished"] * 6, outcomes
     assert sorted(monitor.names) == sorted(cell.name for cell in cells)  # each of them once
+    assert monitor.n_ready == 1
     runs = [read_run(folder) for folder in find_runs(output)]
     assert {(run.name, run.seed) for run in runs} == {(cell.preset, cell.seed) for cell in cells}
     assert all(run.result["timesteps"] == 400 for run in runs)
@@ -110,8 +117,27 @@ def test_a_cell_that_fails_is_reported_and_no_room_is_an_error(cluster, tmp_path
         RayLauncher(cluster.address, cpus_per_cell=2).run(cells, tmp_path, Silent())
 
 
+def test_what_is_finished_when_a_sweep_is_interrupted_is_gathered(cluster, tmp_path, monkeypatch):
+    wait, seen = ray.wait, []
+
+    def interrupted(references, **options):
+        """Ctrl-C after a cell came to its end, before anybody looked."""
+        if not seen:
+            seen.append(wait(references, num_returns=1, timeout=120))
+            raise KeyboardInterrupt
+        return wait(references, **options)
+
+    monkeypatch.setattr(ray, "wait", interrupted)
+    cells = cells_of(scale_file(tmp_path), "table4", seeds=2)
+    with pytest.raises(KeyboardInterrupt):
+        RayLauncher(cluster.address).run(cells, tmp_path, Silent())
+    assert "finished" in [cell_state(cell, tmp_path) for cell in cells]
+    assert not list(tmp_path.rglob("*.running"))
+
+
 def test_no_cluster_is_an_error_that_names_the_remedy(tmp_path):
-    cells = cells_of(scale_file(tmp_path), "table4")
+    cells, monitor = cells_of(scale_file(tmp_path), "table4"), Noting()
     with pytest.raises(ConfigError, match=r"There is no Ray cluster at --ray-address=.*'ray start --head'"):
-        RayLauncher("127.0.0.1:1").run(cells, tmp_path, Silent())
+        RayLauncher("127.0.0.1:1").run(cells, tmp_path, monitor)
+    assert monitor.n_ready == 0  # and so nothing was announced
     assert not list(tmp_path.rglob("*.running"))

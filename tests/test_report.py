@@ -5,9 +5,15 @@ import dataclasses
 import io
 import json
 import os
+import platform
 import re
+import subprocess
+import sys
 from collections import Counter
+from html import unescape
 from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,17 +23,18 @@ from matplotlib.figure import Figure
 
 from sb3_ars.cli import main
 from sb3_ars.errors import ConfigError
-from sb3_ars.experiments import curves, plots
+from sb3_ars.evaluation import EvaluationProtocol
+from sb3_ars.experiments import curves, plots, runner
 from sb3_ars.experiments.config import load_preset, save_config
 from sb3_ars.experiments.report import drawings, figures, forms, page, tables, write_report
 from sb3_ars.experiments.report.blocks import Listing
 from sb3_ars.experiments.report.gather import differences, gather
 from sb3_ars.experiments.report.sections import sections
 from sb3_ars.experiments.report.tables import Row, mean_std
-from sb3_ars.experiments.run_folder import FORMAT, read_run, write_json
+from sb3_ars.experiments.run_folder import read_run, write_json
 from sb3_ars.experiments.runner import train
 from sb3_ars.experiments.scaling import load_scale, scaled
-from sb3_ars.experiments.sweeps import load_sweep, sweep_names
+from sb3_ars.experiments.sweeps import SweepRow, load_sweep, sweep_names
 
 ARS = ([1, 0.8, 0.6, 0.4], [1, 0.6, 0.6, 0.2], [1, 1, 0.6, 0.6])
 SAC = ([1, 1, 0, 0], [1, 1, 0, 0])
@@ -59,26 +66,19 @@ def write_config_run(folder, name, config, success, versions=VERSIONS, evaluatio
             task_names=np.array(tasks),
         )
     scales = [float(10**i) for i in range(len(tasks))] if len(tasks) < 5 else [2.0] * len(tasks)
-    final = {
-        task: {"success": s, "success_sampled": s, "success_at_end": s, "return": 1.0, "length": 50.0, "c": c}
-        for task, s, c in zip(tasks, success, scales, strict=True)
-    }
-    defaults = {
-        "format": FORMAT,
-        "name": name,
-        "seed": config.seed,
-        "mean_success": None if None in success else float(np.mean(success)),
-        "tasks": final,
-        "protocol": "protocol toy: 50 episodes per task, horizon 50",
-        "timesteps": total,
-        "updates": 1000,
-        "resets": 1,
-        "reward_scale_history": [[100, scales], [total // 2, [2 * c for c in scales]]],
-        "training_seconds": 60.0,
-        "seconds_by_part": {"act": 20.0, "critic": 40.0},
-        "interrupted": False,
-    }
-    write_json(folder / "result.json", defaults | result)
+    table = pd.DataFrame(
+        {"success": success, "success_sampled": success, "return": 1.0, "c": scales}, index=tasks, dtype=float
+    )
+    model = SimpleNamespace(
+        num_timesteps=total,
+        _n_updates=1000,
+        n_resets=1,
+        reward_scale_history=[[100, scales], [total // 2, [2 * c for c in scales]]],
+    )
+    protocol = EvaluationProtocol("toy", 50, 50, goals=None)
+    by_part = {"act": 20.0, "critic": 40.0}
+    written = runner._result(name, config, table, protocol, model, 60.0, by_part, False)
+    write_json(folder / "result.json", written | result)
     return folder
 
 
@@ -118,6 +118,10 @@ def table_of(report, name):
     """Row label -> heading -> cell of a table's CSV."""
     lines = list(csv.reader(io.StringIO((report / "tables" / f"{name}.csv").read_text())))
     return {line[0]: dict(zip(lines[0], line, strict=True)) for line in lines[1:]}
+
+
+def text_of(html):
+    return unescape(html)
 
 
 class Page(HTMLParser):
@@ -209,7 +213,14 @@ def test_table_2_takes_the_same_shares_of_fewer_tasks(cells, report):
     assert table.rows[0] == (
         "ARS", "3", "40.0 ± 20.0", "50.0 ± 10.0", "60.0 ± 13.3", "70.0 ± 10.0", "9.1 ± 6.6", "65.9 ± 2.9",
     )  # fmt: skip
+    assert table.notes == (
+        "The paper's k of 50 tasks, and ours of 4, rounded: 10 → 1, 20 → 2, 30 → 2, 40 → 3, 50 → 4.",
+    )
     assert table_of(report, "all-toy-bottom-k")["ARS"]["k = 3"] == "60.0 ± 13.3"
+    section = forms.sweep_section(load_sweep("table2"), "toy", found)
+    assert section.title == "Table 2, “Success of the k worst MT50 tasks”: our runs of scale toy"
+    titles = [block.title for block in section.blocks if isinstance(block, tables.Table)]
+    assert titles == ["Success of the k worst tasks of each seed (%), mean ± std over seeds"]
 
 
 def test_table_3_puts_second_headings_across(report):
@@ -287,6 +298,22 @@ def test_the_scale_is_said_with_what_it_changed(html, parsed):
     assert html.count("3 seeds each") > 0 and "2 to 3 seeds" in html
 
 
+def test_what_the_numbers_cannot_say_is_said(html):
+    assert text_of(html).count(drawings.FEW_SEEDS) >= 3  # the figure, the summary's table, how to read
+    assert (
+        "gives the row of ARS in its Table 4; of the other rows the paper prints no single tasks"
+        in text_of(html)
+    )
+    assert "such as 98 and 62, are not" in text_of(html)
+
+
+def test_the_papers_98_and_62_are_no_means_over_8_seeds_of_10_episodes():
+    possible = {round(100 * successes / 80, 6) for successes in range(81)}
+    assert not possible & {98, 62} and {98.75, 86.25} <= possible
+    printed = [task.split()[0] for row in load_sweep("table1").rows for task in row.paper.get("tasks", ())]
+    assert {"98", "62"} <= set(printed)
+
+
 def test_a_run_as_its_preset_is_has_no_differences(tmp_path):
     config = load_preset("toy")
     write_config_run(tmp_path / "run", "toy", config, ARS[0])
@@ -306,6 +333,37 @@ def test_runs_with_other_options_are_rows_of_their_own(tmp_path):
     write_config_run(tmp_path / "d", "toy", config, ARS[1], timesteps=20_000, interrupted=True)
     labels = {arm.label: len(arm.runs) for arm in gather([tmp_path]).arms}
     assert labels == {"toy": 1, "toy (reward_scaling none)": 2, "toy (stopped at step 20,000)": 1}
+
+
+def test_a_run_that_ended_early_says_so_and_is_no_finished_cell(tmp_path):
+    write_run(tmp_path / "a", "mt10-ars", ARS[0], timesteps=20_000, interrupted=True)
+    cell = ("toy", "mt10-ars", 0)
+    found = gather([tmp_path], [cell])
+    (arm,) = found.arms
+    assert arm.label == "mt10-ars (stopped at step 20,000)"  # though there is no other to tell it from
+    assert found.missing == (cell,) and found.n_expected(arm) == 0
+    overview = sections(found, [], videos=False)[0].blocks
+    assert overview[0].startswith("0 finished runs and 1 that ended early of 1 preset,")
+    assert (
+        overview[1].warning
+        and "toy/mt10-ars, seed 0: stopped at step 20,000 of 24,000" in overview[1].items[0]
+    )
+    rows = forms.sweep_section(load_sweep("table1"), "toy", found).blocks[2].rows
+    assert ("ARS (stopped at step 20,000)", "1") in {row[:2] for row in rows}
+    write_run(tmp_path / "b", "mt10-ars", ARS[0])
+    assert gather([tmp_path], [cell]).missing == ()
+
+
+def test_where_a_run_stopped_is_in_a_label_of_many_differences(tmp_path):
+    config = load_preset("toy")
+    changed = dataclasses.replace(
+        config,
+        algorithm=dataclasses.replace(config.algorithm, batch_size=7, learning_rate=0.1, tau=0.1, gamma=0.5),
+    )
+    write_config_run(tmp_path / "a", "toy", config, ARS[0])
+    write_config_run(tmp_path / "b", "toy", changed, ARS[0], timesteps=20_000)
+    label = gather([tmp_path]).arms[1].label
+    assert "stopped at step 20,000;" in label and label.endswith("; 2 more)")
 
 
 def test_of_a_seed_found_twice_the_newer_run_is_used(tmp_path):
@@ -400,26 +458,39 @@ def test_without_a_finished_run_there_is_no_report(make, message, tmp_path):
     assert not (tmp_path / "report").exists()
 
 
+def respell(run, **changes):
+    """Change entries of a run's result; ``...`` drops one."""
+    result = json.loads((run / "result.json").read_text()) | changes
+    write_json(run / "result.json", {key: value for key, value in result.items() if value is not ...})
+
+
+def cut(path, size):
+    path.write_bytes(path.read_bytes()[:size])
+
+
 BROKEN = {
     "no result": (lambda run: (run / "result.json").unlink(), "did not finish"),
     "another format": (lambda run: write_json(run / "result.json", {"format": 99}), "run format 99"),
     "no JSON": (lambda run: (run / "result.json").write_text("{"), "cannot be read"),
-    "no tasks": (
-        lambda run: write_json(
-            run / "result.json", {**json.loads((run / "result.json").read_text()), "tasks": {}}
-        ),
-        "lacks tasks",
+    "no tasks": (lambda run: respell(run, tasks={}), "lacks tasks"),
+    "a list of tasks": (lambda run: respell(run, tasks=[1]), r"tasks is \[1\], but must be success"),
+    "no success": (lambda run: respell(run, tasks={"reach": {}}), "tasks is .* but must be success"),
+    "no scale history": (
+        lambda run: respell(run, reward_scale_history="x"),
+        "reward_scale_history is 'x', but must be a list",
     ),
-    "no success": (
-        lambda run: write_json(
-            run / "result.json", {**json.loads((run / "result.json").read_text()), "tasks": {"reach": {}}}
-        ),
-        "no final success of task reach",
+    "scales of no task": (
+        lambda run: respell(run, reward_scale_history=[[100, 1.0]]),
+        "reward_scale_history is .* but must be a list",
     ),
+    "no time": (lambda run: respell(run, training_seconds=...), "lacks training_seconds"),
+    "no number of steps": (lambda run: respell(run, timesteps="many"), "timesteps is 'many', but must be"),
+    "no updates": (lambda run: respell(run, updates=...), "lacks updates"),
     "no configuration": (lambda run: (run / "config.yaml").unlink(), "config.yaml does not exist"),
     "no log": (lambda run: (run / "progress.csv").unlink(), "progress.csv cannot be read"),
-    "torn evaluations": (
-        lambda run: (run / "evaluations.npz").write_bytes(b"PK"),
+    "torn evaluations": (lambda run: cut(run / "evaluations.npz", 2), "evaluations.npz cannot be read"),
+    "evaluations cut in the middle": (
+        lambda run: cut(run / "evaluations.npz", 200),
         "evaluations.npz cannot be read",
     ),
 }
@@ -434,7 +505,21 @@ def test_a_broken_run_is_an_error_alone_and_a_warning_among_others(kind, tmp_pat
     write_run(tmp_path / "whole", "mt10-ars", ARS[1], seed=1)
     found = gather([tmp_path])
     assert [run.seed for run in found.runs] == [1]
-    assert len(found.warnings) == 1 and message in found.warnings[0]
+    assert len(found.warnings) == 1 and re.search(message, found.warnings[0])
+
+
+def test_what_cannot_be_read_is_not_blamed_on_the_output(tmp_path, monkeypatch):
+    write_run(tmp_path / "run", "mt10-ars", ARS[0])
+    (tmp_path / "other" / "error.txt").mkdir(parents=True)  # a folder of that name is no word of a failure
+    assert gather([tmp_path]).warnings == ()
+
+    def refused(*_):
+        raise PermissionError(13, "Permission denied", "secret")
+
+    monkeypatch.setattr(page, "gather", refused)
+    with pytest.raises(ConfigError, match=r"runs cannot be read: .*secret") as raised:
+        write_report([tmp_path / "run"], tmp_path / "report")
+    assert "--output" not in str(raised.value)
 
 
 def test_an_unknown_table_is_refused_with_the_nearest_name(cells, tmp_path):
@@ -481,6 +566,43 @@ def test_a_report_is_replaced_whole_and_a_torn_one_has_no_page(tmp_path, monkeyp
     assert not (tmp_path / "new").exists()
 
 
+def test_drafts_of_killed_reports_are_removed_and_those_of_live_ones_kept(tmp_path, monkeypatch):
+    write_run(tmp_path / "run", "mt10-ars", ARS[0])
+    monkeypatch.setattr(page, "sections", lambda *_: [])
+    killed = subprocess.Popen([sys.executable, "-c", ""])
+    killed.wait()
+    drafts = {
+        pid: tmp_path / "report" / f".draft-{platform.node()}-{pid}" for pid in (killed.pid, os.getppid())
+    }
+    elsewhere = tmp_path / "report" / f".draft-another-{killed.pid}"
+    for draft in (*drafts.values(), elsewhere):
+        (draft / "tables").mkdir(parents=True)
+    write_report([tmp_path / "run"], tmp_path / "report")
+    assert not drafts[killed.pid].exists()
+    assert drafts[os.getppid()].is_dir() and elsewhere.is_dir()
+
+
+def test_a_report_written_at_the_same_time_does_not_stop_this_one(tmp_path, monkeypatch):
+    write_run(tmp_path / "run", "mt10-ars", ARS[0])
+    monkeypatch.setattr(page, "sections", lambda *_: [])
+    output = tmp_path / "report"
+    write_report([tmp_path / "run"], output)
+    replace, others = Path.replace, [output / "tables"]
+
+    def replace_beside_another(path, target):
+        if target in others:  # just now, and once, the other puts its tables there
+            others.remove(target)
+            target.mkdir()
+            (target / "others.csv").write_text("")
+        replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", replace_beside_another)
+    index = write_report([tmp_path / "run"], output)
+    assert not others
+    assert index.is_file() and [path.name for path in (output / "tables").iterdir()] == ["all-numbers.csv"]
+    assert {path.name for path in output.iterdir()} == {"index.html", "tables"}
+
+
 # ------------------------------------------------------------------ real runs, many tasks, curves, plots
 
 
@@ -510,6 +632,14 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
     assert "No finished run" in capsys.readouterr().err
 
 
+def test_the_commands_help_says_what_it_does_and_what_happens_without_options(capsys):
+    with pytest.raises(SystemExit):
+        main(["report", "--help"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "Write tables and figures of runs as one HTML page" in out
+    assert "(default: what fits the runs)" in out and "(default: )" not in out
+
+
 def test_with_many_tasks_they_stand_in_rows_and_legends_stay_short(tmp_path):
     success = [round(task / 49, 2) for task in range(50)]
     write_run(tmp_path / "a", "mt50-ars", success, scale="full", evaluations=False)
@@ -525,8 +655,27 @@ def test_with_many_tasks_they_stand_in_rows_and_legends_stay_short(tmp_path):
     assert plots.plot_q_values({"ARS": arm.runs}, ["reach-v3"]).axes[0].lines[0].get_label() == "reach"
 
 
+def test_a_run_without_any_success_is_valid_json_and_can_be_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(drawings, "draw", lambda *about: figures.Drawing(*about[:3], "", ""))
+    run = write_run(tmp_path / "run", "mt10-ars", [None] * 4, evaluations=False)
+
+    def no_number(text):
+        raise ValueError(text)
+
+    result = json.loads((run / "result.json").read_text(), parse_constant=no_number)
+    assert result["mean_success"] is None and result["tasks"]["point-north"]["success"] is None
+    index = write_report([run], tmp_path / "report")
+    assert table_of(index.parent, "all-toy-summary")["mt10-ars"]["mean success (%)"] == tables.MISSING
+    assert set(pd.read_csv(index.parent / "tables" / "all-numbers.csv").success.isna()) == {True}
+
+
+def test_numbers_are_written_in_full_precision(tmp_path):
+    run = read_run(write_run(tmp_path / "run", "mt10-ars", [1 / 3, 0, 0, 0]))
+    assert run.success()[0] == 1 / 3 and run.result["mean_success"] == 1 / 12
+
+
 def test_tasks_without_success_leave_a_dash(tmp_path):
-    write_run(tmp_path / "a", "mt10-ars", [0.5, None, 0.5, None], mean_success=0.5, evaluations=False)
+    write_run(tmp_path / "a", "mt10-ars", [0.5, None, 0.5, None], evaluations=False)
     (arm,) = gather([tmp_path]).arms
     row = Row("ARS", arm)
     assert tables.task_table("t", "t", [row]).rows[0] == ("ARS", "1", "50.0", "-", "50.0", "-", "50.0")
@@ -609,8 +758,15 @@ def test_every_table_and_figure_of_the_paper_has_its_form(tmp_path, monkeypatch)
         assert shown and any(isinstance(block, figures.Drawing) for block in blocks), sweep.name
         assert "50.0" in str(shown[0].rows) or sweep.kind == "estr", sweep.name
         assert not any(isinstance(block, Listing) for block in blocks), sweep.name  # none is missing
+        assert sweep.options.get("note", blocks[0]) in blocks, sweep.name
     assert len(drawn["fig1-toy-curves"].axes) == 4 and len(drawn["fig1-toy-curves"].axes[0].lines) == 3
+    assert len(drawn["fig11-toy-task-bars"].axes[0].patches) == 9 * 4
+    forms.sweep_section(dataclasses.replace(load_sweep("fig11"), kind="bars"), "toy", found)
     assert len(drawn["fig11-toy-bars"].axes[0].patches) == 9
+    # the tasks that stand for the two the paper shows
+    stands_for, (legend,) = load_scale("toy").stands_for, drawn["fig3-toy-q"].legends
+    shown = [text.get_text() for text in legend.get_texts()]
+    assert set(shown) == {stands_for["push-v3"], stands_for["pick-place-v3"], "reset"}
     assert len(drawn["fig10-toy-curves"].axes[0].lines) == 8 + 1  # a line each, and the reset
     assert len(drawn["fig2-toy-task-bars"].axes[0].patches) == 3 * 4
     # in one colour in every figure
@@ -619,6 +775,39 @@ def test_every_table_and_figure_of_the_paper_has_its_form(tmp_path, monkeypatch)
         for name, row in (("fig7-toy-curves", 2), ("fig8-toy-curves", 2))
     }
     assert len(colors) == 1
+
+
+def test_methods_of_other_tasks_stand_in_figures_of_their_own(tmp_path, monkeypatch):
+    drawn = {}
+
+    def draw(name, title, caption, plot):
+        drawn[name] = (title, plot(figures.NARROW))
+        return figures.Drawing(name, title, caption, "", "")
+
+    monkeypatch.setattr(drawings, "draw", draw)
+    config = scaled(load_preset("mt10-ars"), load_scale("toy"))
+    names = config.env.task_names
+    for label, tasks in (("all", names), ("first", names[:2]), ("last", names[2:]), ("alone", names[1:2])):
+        other = dataclasses.replace(config, env=dataclasses.replace(config.env, tasks=tasks))
+        write_config_run(tmp_path / label, "mt10-ars", other, [0.5] * len(tasks))
+    found = gather([tmp_path])
+    sweep = dataclasses.replace(load_sweep("fig5"), rows=(SweepRow("mt10-ars", "ARS"),), options={})
+    for kind, ending in (("scales", "scales"), ("q_values", "q"), ("task_bars", "task-bars")):
+        drawn.clear()
+        forms.sweep_section(dataclasses.replace(sweep, kind=kind), "toy", found)
+        assert list(drawn) == [f"fig5-toy-{ending}-{number}" for number in (1, 2, 3, 4)]
+        titles = [title for title, _ in drawn.values()]
+        assert {
+            f"({len(t)} tasks, {t[0]} to {t[-1]})" in str(titles) for t in (names, names[:2], names[2:])
+        } == {True}
+        assert any(title.endswith(f"(task {names[1]})") for title in titles)
+    labels = {tick.get_text() for _, figure in drawn.values() for tick in figure.axes[0].get_yticklabels()}
+    assert labels == set(names)
+    made = sections(found, [], videos=False)
+    assert len({section.name for section in made}) == len(made)
+    for plot in (plots.plot_scales, plots.plot_q_values, plots.plot_task_success, plots.plot_task_curves):
+        with pytest.raises(ConfigError, match="Draw a figure for each"):
+            plot({arm.label: arm.runs for arm in found.arms})
 
 
 def test_a_task_alone_has_no_tables_of_worst_tasks(tmp_path, monkeypatch):

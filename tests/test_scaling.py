@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from sb3_ars import make_toy_env
 from sb3_ars.envs.toy import TOY_TASKS
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments import preset_names
-from sb3_ars.experiments.config import EnvConfig, load_preset, with_options
+from sb3_ars.experiments.config import EnvConfig, load_config, load_preset, with_options
 from sb3_ars.experiments.runner import build_model, make_env, protocol_of
 from sb3_ars.experiments.scaling import Scale, load_scale, scale_names, scaled
+from sb3_ars.experiments.sweeps import load_sweep
 
 PAPERS = [name for name in preset_names() if name not in ("toy", "demo")]
 SMALLER = [name for name in scale_names() if name != "full"]
@@ -158,6 +160,13 @@ def test_horizons_shorter_than_the_scales_stay(tmp_path):
         ({"options": {"ars": {"n_reset": 2}}}, "ars.n_reset is no scale's to set"),
         ({"options": {"seed": 2}}, "seed is no scale's to set"),
         ({"options": {"env": 2}}, "EnvConfig must be a mapping"),
+        ({"options": 3}, r"options=3 must be a mapping, such as \{env: "),
+        ({"at_most": 3}, r"at_most=3 must be a mapping, such as \{hidden_width: 64\}"),
+        ({"at_most": None}, "at_most=None must be a mapping"),
+        ({"tasks": "toy", "stands_for": ["push-v3"]}, r"stands_for=\('push-v3',\) must be a mapping"),
+        ({"tasks": 3}, "tasks=3 must be a benchmark's name or a list of tasks"),
+        ({"tasks": [3]}, r"tasks=\(3,\) must be a benchmark's name or a list of tasks"),
+        ({"description": 3}, "description=3 must be a line of text"),
     ],
 )  # fmt: skip
 def test_a_scale_that_cannot_work_is_refused_by_name(values, message, tmp_path):
@@ -166,9 +175,18 @@ def test_a_scale_that_cannot_work_is_refused_by_name(values, message, tmp_path):
 
 
 def test_a_file_that_is_no_scale_is_refused(tmp_path):
-    (tmp_path / "mine.yaml").write_text("tasks: [")
-    with pytest.raises(ConfigError, match=r"mine.yaml is not valid YAML"):
-        load_scale(str(tmp_path / "mine.yaml"))
+    assert load_scale(own(tmp_path, options={"env": None})).options == {
+        "env": None
+    }  # a part with nothing in it
+    path = tmp_path / "mine.yaml"
+    for load in (load_scale, load_sweep, lambda name: load_config(Path(name))):
+        path.write_text("tasks: [")
+        with pytest.raises(ConfigError, match=r"mine.yaml is not valid YAML: .*line 1") as caught:
+            load(str(path))
+        assert "\n" not in str(caught.value)
+        path.write_bytes(b"\xff\xfe")
+        with pytest.raises(ConfigError, match=r"mine.yaml is no text in UTF-8; save it as that"):
+            load(str(path))
     (tmp_path / "mine.yaml").write_text("- toy")
     with pytest.raises(ConfigError, match="must be a mapping of a scale's options"):
         load_scale(str(tmp_path / "mine.yaml"))
@@ -183,9 +201,12 @@ def test_a_task_that_nothing_stands_for_is_refused(tmp_path):
         scaled(load_preset("single-basketball-scale-1"), scale)
 
 
-def test_every_option_of_a_scale_is_documented():
-    from pathlib import Path
+def test_descriptions_hold_no_times():
+    for name in scale_names():
+        assert "minute" not in load_scale(name).description
 
+
+def test_every_option_of_a_scale_is_documented():
     page = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()
     for option in dataclasses.fields(Scale):
         if option.name != "name":

@@ -1,7 +1,10 @@
 """Tables and figures as data, their cells, and the local launcher."""
 
+import errno
 import json
 import os
+import platform
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +24,7 @@ from sb3_ars.experiments import find_presets, preset_info, preset_names
 from sb3_ars.experiments.cells import cell_state, claim, clean, plan
 from sb3_ars.experiments.config import load_preset
 from sb3_ars.experiments.launchers import LocalLauncher
+from sb3_ars.experiments.owner import this_process
 from sb3_ars.experiments.run_folder import find_runs, is_finished, read_run
 from sb3_ars.experiments.sweeps import KINDS, load_sweep, sweep_names
 
@@ -76,6 +80,10 @@ def test_the_task_sets_means_make_the_whole(name):
         assert 0.7 * easy + 0.3 * difficult == pytest.approx(numbers(row.paper["mean"])[0], abs=0.25)
 
 
+def test_figure_11_shows_single_tasks():
+    assert load_sweep("fig11").kind == "task_bars"
+
+
 def test_every_preset_that_the_paper_reports_is_in_the_table_it_names():
     for name in preset_names():
         table = preset_info(name).table
@@ -90,6 +98,10 @@ def test_no_two_rows_of_a_sweep_look_the_same():
     for sweep in map(load_sweep, sweep_names()):
         headings = [(row.label, row.column) for row in sweep.rows]
         assert len(set(headings)) == len(headings) and len(sweep.presets) == len(headings), sweep.name
+
+
+def with_paper(**printed):
+    return {"preset": "mt10-ars", "label": "ARS", "paper": printed}
 
 
 GOOD = {"title": "t", "source": "s", "kind": "mean", "rows": [{"preset": "mt10-ars", "label": "ARS"}]}
@@ -107,6 +119,18 @@ GOOD = {"title": "t", "source": "s", "kind": "mean", "rows": [{"preset": "mt10-a
         ({"rows": [{"preset": "mt10-asr", "label": "a"}]}, "row 1: there is no preset 'mt10-asr'.*'mt10-ars'"),
         ({"rows": [{"preset": "mt10-ars", "label": "a", "paper": {"men": 1}}]}, "row 1: paper: 'men' is no key"),
         ({"rows": ["mt10-ars"]}, "row 1 must be a mapping with the keys preset, label, column, paper"),
+        ({"rows": [{"preset": "mt10-ars", "label": None}]}, "row 1: label=None must be text"),
+        ({"rows": [with_paper(tasks="1 ± 2")]}, "row 1: paper: tasks='1 ± 2' must be a list"),
+        ({"rows": [with_paper(bottom_k=[1])]}, r"row 1: paper: bottom_k=\[1\] must be a mapping"),
+        ({"rows": [with_paper(mean=[1])]}, r"row 1: paper: mean=\[1\] must be text"),
+        ({"options": 3}, "mine.yaml: options must be a mapping"),
+        ({"kind": "bottom_k", "options": {"ks": "foo"}}, "option ks='foo' must be a list of integers"),
+        ({"kind": "bottom_k", "options": {"ks": [0]}}, r"option ks=\[0\] must be a list of integers of at least 1"),
+        ({"kind": "estr", "options": {"thresholds": [5]}}, r"option thresholds=\[5\] must be a list of shares"),
+        ({"kind": "task_sets", "options": {"n_easy": "many"}}, "option n_easy='many' must be an integer"),
+        ({"kind": "q_values", "options": {"tasks": "push-v3"}}, "option tasks='push-v3' must be a list of tasks"),
+        ({"kind": "curves", "options": {"each_seed": 1}}, "option each_seed=1 must be true or false"),
+        ({"options": {"note": 1}}, "option note=1 must be a sentence"),
     ],
 )  # fmt: skip
 def test_a_sweep_that_cannot_work_is_refused_by_name(changes, message, tmp_path):
@@ -119,6 +143,16 @@ def test_a_sweep_that_cannot_work_is_refused_by_name(changes, message, tmp_path)
 def test_a_sweep_of_ones_own_is_a_file_and_a_wrong_name_is_refused(tmp_path):
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(GOOD))
     assert load_sweep(str(tmp_path / "mine.yaml")).presets == ("mt10-ars",)
+    numbers = {
+        "title": 5,
+        "source": 7,
+        "rows": [{**with_paper(mean=5, bottom_k={10: 1}), "label": 3, "column": 1}],
+    }
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**GOOD, **numbers}))
+    sweep = load_sweep(str(tmp_path / "mine.yaml"))
+    (row,) = sweep.rows
+    assert (sweep.title, sweep.source, row.label, row.column) == ("5", "7", "3", "1")
+    assert row.paper == {"mean": "5", "bottom_k": {10: "1"}}
     with pytest.raises(ConfigError, match=r"no table or figure 'tabel1'.*Did you mean 'table1'"):
         load_sweep("tabel1")
 
@@ -199,6 +233,10 @@ run.mkdir()
 result = {"format": 1, "name": spec["preset"], "mean_success": 1.0, "tasks": {}, "reward_scale_history": [],
           "timesteps": 1, "training_seconds": 1.0, "interrupted": act == "interrupted"}
 (run / "result.json").write_text(json.dumps(result))
+if act == "dies after":
+    os.kill(os.getpid(), signal.SIGSEGV)
+if act == "sleeps after":
+    time.sleep(60)
 """  # as a cell's process, but trains nothing
 
 
@@ -221,6 +259,9 @@ def fake(tmp_path, monkeypatch):
 
 
 class Silent:
+    def ready(self):
+        pass
+
     def started(self, cell):
         pass
 
@@ -323,6 +364,106 @@ def ended_process():
     return process.pid
 
 
+def test_a_run_that_is_whole_is_kept_however_its_process_or_the_sweep_ends(tiny, fake, tmp_path, monkeypatch):
+    monkeypatch.setenv("ACT_mt10_ars", "dies after")
+    (cell,) = cells_of(tiny, "table4", only=["mt10-ars"])
+    assert launch([cell], tmp_path)["mt10-ars/seed0"].status == "finished"
+    assert cell_state(cell, tmp_path) == "finished"
+    monkeypatch.setenv("ACT_mt10_ars", "sleeps after")
+
+    class Interrupting(Silent):
+        def progressed(self, cell, steps):
+            if list((tmp_path / "other").rglob("result.json")):
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        launch([cell], tmp_path / "other", Interrupting())
+    assert cell_state(cell, tmp_path / "other") == "finished"
+    assert not list(tmp_path.rglob("*.running"))
+
+
+def test_a_cell_whose_folder_cannot_be_written_fails_and_the_others_go_on(tiny, fake, tmp_path, monkeypatch):
+    output, cells = tmp_path / "out", cells_of(tiny, "table4")
+    (gone,) = (cell for cell in cells if cell.preset == "mt10-ars")
+    monkeypatch.setenv("ACT_mt10_ars", "raises")
+
+    class Removing(Silent):
+        def started(self, cell):
+            if cell == gone:
+                shutil.rmtree(disk._working(cell, output))
+
+    outcomes = launch(cells, output, Removing())
+    assert outcomes["mt10-ars/seed0"].error.startswith("FileNotFoundError: ")
+    assert [cell_state(cell, output) for cell in cells if cell != gone] == ["finished", "finished"]
+
+    write = disk.write_json
+
+    def full(path, value):
+        write(path, value)
+        if value.get("preset") == "mt10-ars":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(disk, "write_json", full)
+    outcomes = launch(cells, tmp_path / "full")
+    assert outcomes["mt10-ars/seed0"].error == "OSError: [Errno 28] No space left on device"
+    assert sorted(outcome.status for outcome in outcomes.values()) == ["failed", "finished", "finished"]
+    assert not list((tmp_path / "full").rglob("*.running"))
+
+
+CLAIM = """
+import os, sys, time
+from pathlib import Path
+from sb3_ars.experiments import cells
+from sb3_ars.experiments.sweeps import load_sweep
+(cell,) = cells.plan([load_sweep("table4")], [sys.argv[1]], 1, ["mt10-ars"])
+for turn in range(int(sys.argv[3])):
+    print("ready", flush=True)
+    sys.stdin.readline()
+    try:
+        print(cells.claim(cell, Path(sys.argv[2]) / str(turn)) is not None, flush=True)
+    except Exception as error:
+        print(type(error).__name__, flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_of_two_sweeps_that_start_at_once_over_leftovers_one_gets_the_cell(tiny, tmp_path):
+    (cell,) = cells_of(tiny, "table4", only=["mt10-ars"])
+    turns, dead = 20, json.dumps({**this_process(), "pid": ended_process()})
+    for turn in range(turns):
+        working = disk._working(cell, tmp_path / str(turn))
+        (working / "run").mkdir(parents=True)
+        (working / "owner.json").write_text(dead)
+        for number in range(200):  # takes a while to remove
+            (working / "run" / str(number)).touch()
+    command = [sys.executable, "-c", CLAIM, tiny, str(tmp_path), str(turns)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes) as one, subprocess.Popen(command, **pipes) as other:
+        for _ in range(turns):
+            for process in (one, other):
+                assert process.stdout.readline() == "ready\n"
+            for process in (one, other):
+                process.stdin.write("go\n")
+                process.stdin.flush()
+            said = sorted(process.stdout.readline().strip() for process in (one, other))
+            assert said == ["False", "True"]
+        for turn in range(turns):  # of the one that got it nothing was removed
+            working = disk._working(cell, tmp_path / str(turn))
+            assert sorted(path.name for path in working.iterdir()) == ["owner.json", "spec.json"]
+        for process in (one, other):
+            process.stdin.close()
+
+
+def test_a_workers_number_that_is_left_open_is_the_cells_share_of_the_cores(tmp_path):
+    (cell,) = plan([load_sweep("table4")], ["full"], 1, ["mt10-ars"])
+    assert cell.config.env.n_workers == "auto"
+    workers = []
+    for cpus in (1, 3, 64):
+        spec = json.loads((claim(cell, tmp_path / str(cpus), cpus) / "spec.json").read_text())
+        workers.append(spec["config"]["env"]["n_workers"])
+    assert workers == [0, 3, 10]  # none beside the cell's own process, and no more than tasks
+
+
 def test_what_a_killed_sweep_left_is_cleared_away_but_not_what_is_in_work(tiny, fake, tmp_path):
     (cell,) = cells_of(tiny, "table4", only=["mt10-ars"])
     working = claim(cell, tmp_path)
@@ -331,6 +472,12 @@ def test_what_a_killed_sweep_left_is_cleared_away_but_not_what_is_in_work(tiny, 
     owner = json.loads((working / "owner.json").read_text())
     (working / "owner.json").write_text(json.dumps({**owner, "host": "another"}))
     assert cell_state(cell, tmp_path) == "running"  # nobody here can know
+    # the clock was set since
+    (working / "owner.json").write_text(json.dumps({**owner, "started": owner["started"] - 3}))
+    assert cell_state(cell, tmp_path) == "running"
+    # the pid lives, but in another container of this machine
+    (working / "owner.json").write_text(json.dumps({**owner, "host": f"{platform.node()} pid:[1]"}))
+    assert cell_state(cell, tmp_path) == "running"
     # the pid lives, but it is another process's
     (working / "owner.json").write_text(json.dumps({**owner, "started": owner["started"] - 100}))
     assert cell_state(cell, tmp_path) == "missing"
@@ -338,11 +485,13 @@ def test_what_a_killed_sweep_left_is_cleared_away_but_not_what_is_in_work(tiny, 
     assert cell_state(cell, tmp_path) == "missing"
     clean(cell, tmp_path)
     assert not working.exists()
-    # one killed before it had written its name
-    working.mkdir()
-    assert cell_state(cell, tmp_path) == "running"
-    os.utime(working, (1, 1))
-    assert cell_state(cell, tmp_path) == "missing"
+    # one killed while it wrote its name, or its result
+    for name in ("owner.json", "run/result.json"):
+        (working / "run").mkdir(parents=True)
+        (working / name).write_text("{")
+        assert cell_state(cell, tmp_path) == "missing"
+        clean(cell, tmp_path)
+        assert not working.exists()
     assert launch([cell], tmp_path)["mt10-ars/seed0"].status == "finished"
 
 
@@ -361,13 +510,41 @@ def test_a_finished_cell_of_another_configuration_is_refused(tiny, fake, tmp_pat
     launch([cell], tmp_path)
     (changed,) = cells_of(scale_file(tmp_path, steps_per_task=200), "table4", only=["mt10-ars"])
     message = (
-        "seed0 holds a run with algorithm.total_timesteps=400, but tiny/mt10-ars/seed0 is now to have 800 and"
+        "seed0 holds a run with algorithm.total_timesteps=400, but tiny/mt10-ars/seed0 is now to have 800 "
+        r"\(differing options in all: 2\); delete the folder"
     )
-    with pytest.raises(ConfigError, match=f"{message} 2 more options differ; delete the folder"):
+    with pytest.raises(ConfigError, match=message):
         cell_state(changed, tmp_path)
     changed.folder(tmp_path / "other").mkdir(parents=True)
     with pytest.raises(ConfigError, match="exists but holds no finished run"):
         cell_state(changed, tmp_path / "other")
+    # what changes nothing that is learned does not matter
+    (looked_at,) = cells_of(scale_file(tmp_path, evaluations=4, log_episodes=3), "table4", only=["mt10-ars"])
+    assert cell_state(looked_at, tmp_path) == "finished"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"interrupted": True}, "seed0 exists but holds no finished run, or one that was ended early"),
+        ({"name": "mine"}, "holds a run of tiny/mine/seed0, not of tiny/mt10-ars/seed0; delete the folder"),
+    ],
+)
+def test_a_finished_folder_that_is_no_run_of_the_cell_is_refused(changes, message, tiny, fake, tmp_path):
+    (cell,) = cells_of(tiny, "table4", only=["mt10-ars"])
+    launch([cell], tmp_path)
+    result = cell.folder(tmp_path) / "result.json"
+    result.write_text(json.dumps({**json.loads(result.read_text()), **changes}))
+    with pytest.raises(ConfigError, match=message):
+        cell_state(cell, tmp_path)
+
+
+def test_a_file_in_the_place_of_a_cells_folder_is_refused(tiny, tmp_path):
+    (cell,) = cells_of(tiny, "table4", only=["mt10-ars"])
+    cell.folder(tmp_path).parent.mkdir(parents=True)
+    disk._working(cell, tmp_path).write_text("")
+    with pytest.raises(ConfigError, match=r"seed0.running is no folder, .*; move it away"):
+        cell_state(cell, tmp_path)
 
 
 def test_a_cells_process_ends_with_the_one_that_started_it(tiny, tmp_path):
@@ -424,9 +601,12 @@ def test_the_command_trains_reports_and_names_what_failed(tiny, reported, tmp_pa
     assert main([*arguments, "--dry-run"]) == 0
     out = capsys.readouterr().out
     assert "tiny/mt10-ars/seed0 finished" in out and "tiny/mt10-smt/seed0 failed" in out
+    # a cell that another process works on is not finished either
+    assert claim(cells_of(tiny, "table1", only=["mt10-smt"])[0], output) is not None
+    assert main(arguments) == 1 and "1 finished, 1 running" in capsys.readouterr().out
     assert main([a for a in arguments if a != "mt10-smt"]) == 0
     assert "1 cell:" in capsys.readouterr().out and (folder / "result.json").stat().st_mtime_ns == before
-    assert len(reported) == 2
+    assert len(reported) == 3
 
 
 @pytest.mark.parametrize(
@@ -443,6 +623,10 @@ def test_the_command_trains_reports_and_names_what_failed(tiny, reported, tmp_pa
         (["table1", "--ray-address", "auto"], "--ray-address goes with --launcher ray"),
         (["table1", "--gpus-per-cell", "1"], "--gpus-per-cell goes with --launcher ray"),
         (["table4", "--scale", "toy", "--output", "{file}"], "choose another --output"),
+        (
+            ["table4", "--scale", "toy", "--output", "{file}/a", "--dry-run"],
+            "file is no folder; choose another",
+        ),
     ],
 )
 def test_a_mistake_is_named_before_anything_is_trained(arguments, message, fake, tmp_path, capsys):
@@ -470,12 +654,18 @@ def test_a_terminal_shows_bars(tiny, fake, tmp_path, monkeypatch):
     terminal = StringIO()
     monkeypatch.setattr(bench, "Console", lambda **_: Console(file=terminal, force_terminal=True, width=120))
     cells = cells_of(tiny, "table4")
-    with bench._monitor(len(cells)) as monitor:
+    with bench._monitor(len(cells), "3 to train") as monitor:
+        monitor.ready()
         monitor.started(cells[0])
         monitor.progressed(cells[0], 100)
         launch(cells[1:], tmp_path, monitor)
     shown = terminal.getvalue()
-    assert cells[0].name in shown and "100 of 400 steps" in shown and "2 of 3 cells" in shown
+    assert (
+        "to train" in shown
+        and cells[0].name in shown
+        and "100 of 400 steps" in shown
+        and "2 of 3 cells" in shown
+    )
 
 
 def test_steps_are_read_from_the_log(tmp_path):

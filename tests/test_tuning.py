@@ -4,15 +4,19 @@ import dataclasses
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
 import optuna
 import pandas as pd
+import psutil
 import pytest
+import yaml
 from optuna.trial import TrialState
 
 from sb3_ars.cli import main
@@ -73,6 +77,10 @@ def fake_train(monkeypatch, success, curve=(), error=None):
 
     monkeypatch.setattr(objective, "train", train)
     return trained
+
+
+def load_yaml(path):
+    return yaml.safe_load(path.read_text())
 
 
 def by_resets(config):
@@ -143,12 +151,22 @@ def test_lists_are_choices_too():
         ),
         ({}, "has no options"),
         ("n_rest", "no search space 'n_rest'. Did you mean 'n_reset'"),
-        ("missing.yaml", "cannot be read: No such file"),
+        ("missing.yaml", "cannot be read .No such file"),
     ],
 )
 def test_a_wrong_space_is_refused_by_name(space, message):
     with pytest.raises(ConfigError, match=message):
         load_search_space(space)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(b"\xff: 1\n", "no text in UTF-8"), (b"a: [1\nb: 2\n", "not valid YAML")]
+)
+def test_a_space_s_file_that_cannot_be_read_is_refused_in_one_line(content, message, tmp_path):
+    (tmp_path / "mine.yaml").write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"mine\.yaml is {message}") as raised:
+        load_search_space(tmp_path / "mine.yaml")
+    assert len(str(raised.value).splitlines()) == 1
 
 
 def test_a_preset_that_never_resets_has_no_n_reset_to_tune(tmp_path):
@@ -299,9 +317,12 @@ def test_runs_of_a_study_that_the_storage_does_not_know_are_not_mixed_with(tmp_p
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n_trials": 0}, "n_trials=0"),
-        ({"n_seeds": 0}, "n_seeds=0"),
-        ({"timeout": -1.0}, "timeout=-1.0"),
+        ({"n_trials": 0}, r"n_trials \(--n-trials\)=0"),
+        ({"n_seeds": 0}, r"n_seeds \(--seeds\)=0"),
+        ({"n_evaluations": -1}, r"n_evaluations \(--evaluations\)=-1"),
+        ({"n_evaluations": 60_000}, r"\(--evaluations\)=60000 must be fewer than the run's 48000 steps"),
+        ({"timeout": -1.0}, r"timeout \(--timeout\) is -1 s"),
+        ({"seed": -1}, r"seed \(--sampler-seed\)=-1"),
         ({"pruner": "medain"}, "Did you mean 'median'"),
         ({"pruner": "wilcoxon", "n_seeds": 1}, "can never prune"),
         ({"preset": "toi"}, "Did you mean 'toy'"),
@@ -326,6 +347,30 @@ def test_a_missing_driver_is_named_with_its_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "psycopg", None)
     with pytest.raises(ConfigError, match=r'pip install "sb3-ars\[postgres\]"'):
         tune("toy", output=tmp_path, storage="postgresql+psycopg://me:hush@127.0.0.1/x")
+
+
+def test_a_database_that_never_answers_is_asked_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_ars.tuning.storage._CONNECT_TIMEOUT", 2)  # the least the driver takes
+    with socket.socket() as mute:
+        mute.bind(("127.0.0.1", 0))
+        mute.listen()
+        mute.settimeout(0)
+        url = f"postgresql+psycopg://me@127.0.0.1:{mute.getsockname()[1]}/x"
+        with pytest.raises(ConfigError, match=r"cannot be reached.*timeout"):
+            tune("toy", output=tmp_path, storage=url)
+        mute.accept()[0].close()
+        with pytest.raises(BlockingIOError):  # nobody else called
+            mute.accept()
+
+
+def test_the_command_warns_of_sqlite_in_one_line(tmp_path, monkeypatch, capsys):
+    fake_train(monkeypatch, by_resets)
+    where = f"sqlite:///{tmp_path}/s.db"
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        main(["tune", "toy", "--n-trials", "1", "--output", str(tmp_path), "--storage", where])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"warning: {where}: SQLite is not made for several processes")
 
 
 def test_sqlite_works_with_a_warning(tmp_path, monkeypatch):
@@ -360,6 +405,19 @@ def test_a_drop_at_a_reset_does_not_count_against_a_trial(tmp_path, monkeypatch)
     study = tune("toy", n_trials=1, n_seeds=1, output=tmp_path)
     values = study.trials[0].intermediate_values
     assert values[1] == values[2] == values[3] == values[4] > 0
+
+
+def test_the_wilcoxon_pruner_pairs_equal_seeds_only(tmp_path, monkeypatch):
+    # runs of seeds 1 and 2 are worse than that of seed 0, by luck alone
+    trained = fake_train(monkeypatch, lambda config: np.array([0.9, 0.8, 0.7, 0.6]) - 0.1 * (config.seed > 0))
+    study = optuna.create_study(direction="maximize", pruner=make_pruner("wilcoxon", n_seeds=2))
+    for n_reset in (4, 4, 5):
+        study.enqueue_trial({"ars.n_reset": n_reset})
+    study.optimize(make_objective("toy", n_seeds=2, output=tmp_path), n_trials=3, catch=(TrialFailed,))
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 3
+    assert [config.seed for config in trained] == [0, 1, 2, 3, 0, 1]
+    steps = [sorted(trial.intermediate_values) for trial in study.trials]
+    assert steps == [list(range(8)), list(range(8, 16)), list(range(8))]  # 4 tasks a seed
 
 
 def test_the_wilcoxon_pruner_ends_a_trial_after_its_first_run_by_its_tasks(tmp_path, monkeypatch):
@@ -447,7 +505,8 @@ def test_a_killed_processs_trial_is_marked_failed_and_tried_once_more(tmp_path, 
     killed = worker(tmp_path, 3, 600)
     wait_for((tmp_path / "s" / "trial0" / "started").exists)
     killed.send_signal(signal.SIGKILL)
-    # not waited for yet: a zombie is dead too
+    # not waited for by its parent: a zombie is dead too
+    wait_for(lambda: psutil.Process(killed.pid).status() == psutil.STATUS_ZOMBIE)
     fake_train(monkeypatch, by_resets)
     study = tune("toy", n_trials=3, n_seeds=1, output=tmp_path, name="s", pruner="none")
     killed.communicate()
@@ -575,7 +634,28 @@ def test_figures_that_need_more_are_left_out_with_a_sentence(tmp_path):
         "The figure importance is left out: it needs two options.",
         "The figure parallel is left out: it needs two options.",
     ]
-    assert not list(tmp_path.glob("*unfinished*"))
+    names = {"trials.csv", "best.yaml", "history.png", "history.svg", "slice.png", "slice.svg"}
+    assert {file.name for file in tmp_path.iterdir()} == names
+
+
+def test_two_processes_that_end_a_study_at_once_write_whole_files(tmp_path, monkeypatch):
+    study = added([(4, [0.9, 0.8]), (5, [0.1, 0.2])], seeds=[0, 1])
+    replace, is_the_other = Path.replace, False
+
+    def replace_after_the_other(path, target):
+        nonlocal is_the_other
+        if not is_the_other:
+            is_the_other = True
+            with monkeypatch.context() as of_the_other:  # it comes in between, and ends first
+                of_the_other.setattr(os, "getpid", lambda: -1)
+                write_results(study, tmp_path)
+            is_the_other = False
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", replace_after_the_other)
+    files, _ = write_results(study, tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} == {file.name for file in files}
+    assert load_yaml(tmp_path / "best.yaml")["seed"] == 2 and len(pd.read_csv(tmp_path / "trials.csv")) == 2
 
 
 def test_the_command_tunes_tells_and_hands_over_the_best(tmp_path, monkeypatch, capsys):
@@ -595,7 +675,9 @@ def test_the_command_tunes_tells_and_hands_over_the_best(tmp_path, monkeypatch, 
     best = load_config(folder / "best.yaml")
     study = load_study("toy-learning-toy", output=tmp_path)
     assert best.ars.n_reset == study.best_params["ars.n_reset"] and best.ars.param_resets is None
-    assert best.scale == "toy" and best.seed == 0
+    seeds = [seed for trial in study.trials for seed in trial.user_attrs["seeds"]]
+    assert best.scale == "toy" and best.seed == max(seeds) + 1 and best.seed not in seeds
+    assert f"a seed that no trial used, {best.seed} " in out
     # and the very same command again finds nothing to do
     assert main([*arguments, "--output", str(tmp_path), "--pruner", "none"]) == 0
     assert "6 complete" in capsys.readouterr().out
@@ -631,8 +713,40 @@ def test_the_command_has_readable_help(capsys, monkeypatch):
         assert name in out
 
 
-def test_a_journal_that_is_none_is_refused(tmp_path):
+def test_the_command_announces_nothing_before_everything_is_checked(tmp_path, capsys):
+    assert main(["tune", "nosuch", "--output", str(tmp_path)]) == 2
+    assert main(["tune", "toy", "--seeds", "0", "--output", str(tmp_path)]) == 2
+    read = capsys.readouterr()
+    assert read.out == "" and "nosuch" in read.err
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"this is no journal\nat all\n",
+        b"one bad line\n",
+        b"half a line",
+        b"\n",
+        b"\0\n",
+        b"1\n",
+        b"\xff\n",
+        b"{}\n",
+    ],
+)
+def test_a_journal_that_is_none_is_refused(content, tmp_path):
     path = tmp_path / "journal.log"
-    path.write_text("this is no journal\nat all\n")
-    with pytest.raises(ConfigError, match="no journal of Optuna's"):
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"no journal of Optuna's.*give another --storage"):
         open_storage(path)
+    assert path.read_bytes() == content
+
+
+def test_a_journal_with_a_damaged_last_line_is_refused(tmp_path, monkeypatch):
+    fake_train(monkeypatch, by_resets)
+    tune("toy", n_trials=1, n_seeds=1, output=tmp_path, name="s")
+    path = tmp_path / "s" / "journal.log"
+    open_storage(path)
+    lines = path.read_bytes().count(b"\n")
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(ConfigError, match=f"line {lines}"):
+        tune("toy", n_trials=2, n_seeds=1, output=tmp_path, name="s")

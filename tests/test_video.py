@@ -202,13 +202,28 @@ def test_the_command_writes_into_the_run_s_folder(run, capsys, tmp_path):
         (["--task", "point-east", "--output", "a.avi"], "not as 'avi'"),
         (["--task", "point-east", "--output", "a.gif", "--format", "mp4"], "not as 'gif' for a.gif"),
         (["--task", "point-east", "--format", "gif", "--size", "65"], "must be even"),
-        (["--task", "point-east", "--format", "gif", "--episodes", "0"], "n_episodes=0"),
+        (["--task", "point-east", "--format", "gif", "--episodes", "0"], "n_episodes (--episodes)=0"),
+        (
+            ["--task", "point-east", "--format", "gif", "--output", "sweep"],
+            "sweep needs a suffix, .mp4 or .gif",
+        ),
+        (
+            ["--task", "point-east", "--format", "gif", "--camera", "nosuch"],
+            "camera='nosuch' is for Meta-World",
+        ),
         (["--task", "point-east", "--output", "/proc/a.gif"], "/proc/a.gif cannot be written"),
     ],
 )
 def test_mistakes_are_named(run, arguments, message, capsys):
     assert main(["video", str(run), *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_command_s_help_begins_with_a_sentence(capsys):
+    with pytest.raises(SystemExit):
+        main(["video", "--help"])
+    out = capsys.readouterr().out
+    assert "Record what a finished run's policy does" in out.partition("positional arguments")[0]
 
 
 def test_a_folder_without_a_finished_run_is_refused(tmp_path, capsys):

@@ -319,7 +319,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
                 raise ConfigError(f"{option}={value!r} must be between 0 and 1.")
         if not callable(self.learning_rate) and not self.learning_rate >= 0:
-            raise ConfigError(f"learning_rate={self.learning_rate!r} must be a number of at least 0, or a schedule.")
+            raise ConfigError(
+                f"learning_rate={self.learning_rate!r} must be a number of at least 0, or a schedule."
+            )
         ent_coef = self.ent_coef  # type: ignore[attr-defined]  # SAC's and TQC's
         is_auto = isinstance(ent_coef, str) and ent_coef.split("_")[0] == "auto"
         if not is_auto and (isinstance(ent_coef, str) or not ent_coef >= 0):

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
 from sb3_ars.errors import ConfigError
-from sb3_ars.experiments.cells import Cell, cell_state, clean, failed_folder, plan
+from sb3_ars.experiments.cells import Cell, CellState, cell_state, clean, failed_folder, plan
 from sb3_ars.experiments.launchers import Launcher, LocalLauncher, Monitor, Outcome, RayLauncher
 from sb3_ars.experiments.run_folder import is_finished, read_run
 from sb3_ars.experiments.scaling import load_scale, scale_names
@@ -29,16 +29,19 @@ __all__ = ["main"]
 
 @dataclass(frozen=True)
 class _BenchArguments:
-    """Train the cells (scale, preset, seed) of the paper's tables and figures, each once, and report them."""
+    """Train the paper's tables and figures, and report them.
 
-    tables: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Tables and figures, such as table1 fig11, or paths of YAML files; none lists them."""
+    A cell is one preset at one scale with one seed; each is trained once, however many tables show it.
+    """
+
+    tables: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = ()
+    """Tables and figures, such as table1 fig11, or paths of YAML files; sb3-ars bench alone lists them."""
     scale: tuple[str, ...] = ("full",)
     """Sizes to train at: full is the paper's; or paths of YAML files."""
     seeds: int = 8
-    """Seeds of each preset: 0 to this, without it."""
-    only: tuple[str, ...] = ()
-    """Presets to train; none given trains all that the tables have."""
+    """Number of seeds: 3 means seeds 0, 1 and 2."""
+    only: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
+    """Presets to train, of those that the tables have."""
     output: Path = Path("sweep")
     """Folder that holds the sweep's runs; finished ones in it are not trained again."""
     launcher: Literal["local", "ray"] = "local"
@@ -46,7 +49,7 @@ class _BenchArguments:
     processes: int | None = None
     """Cells at a time (local); None is as many as there are cores for."""
     cpus_per_cell: int = 1
-    """Cores of each cell, which are its threads too."""
+    """Cores, and threads, of each cell."""
     gpus_per_cell: float | None = None
     """GPUs, or share of one, of each cell (ray); local shares all GPUs out in turn."""
     ray_address: str | None = None
@@ -58,7 +61,7 @@ class _BenchArguments:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command; return its exit status: 1 if a cell failed.
+    """Run the command; return its exit status: 1 if a cell is not finished at the end.
 
     :param arguments: behind the command's name
     """
@@ -72,20 +75,21 @@ def main(arguments: list[str]) -> int:
     cells = plan(sweeps, options.scale, options.seeds, options.only)
     launcher = _launcher(options)
     if options.dry_run:
+        _check_folder(options.output)
         _print_cells(cells, options.output, {})
         return 0
-    _check_writable(options.output)
-    for cell in cells:
-        clean(cell, options.output)
+    _clean_all(cells, options.output)
     waiting = [cell for cell in cells if cell_state(cell, options.output) in ("missing", "failed")]
     steps = sum(cell.config.algorithm.total_timesteps for cell in waiting)
-    print(f"{_cells(len(cells))} in {options.output}, {len(waiting)} to train: {steps:,} environment steps.")
-    print("Ctrl-C ends it; the same command goes on where it stopped.", flush=True)
-    with _monitor(len(waiting)) as monitor:
+    announcement = (
+        f"{_cells(len(cells))} in {options.output}, {len(waiting)} to train: {steps:,} environment steps.\n"
+        "Ctrl-C ends it; the same command goes on where it stopped."
+    )
+    with _monitor(len(waiting), announcement) as monitor:
         outcomes = launcher.run(waiting, options.output, monitor)
-    failed = _print_cells(cells, options.output, {outcome.cell: outcome for outcome in outcomes})
+    states = _print_cells(cells, options.output, {outcome.cell: outcome for outcome in outcomes})
     _report(cells, options)
-    return 1 if failed else 0
+    return 0 if set(states) == {"finished"} else 1
 
 
 def _launcher(options: _BenchArguments) -> Launcher:
@@ -104,10 +108,20 @@ def _launcher(options: _BenchArguments) -> Launcher:
     return LocalLauncher(options.processes, options.cpus_per_cell)
 
 
-def _check_writable(output: Path) -> None:
+def _check_folder(output: Path) -> None:
+    there = next(path for path in (output, *output.parents) if path.exists())
+    if not there.is_dir():
+        raise ConfigError(f"{there} is no folder; choose another --output.")
+
+
+def _clean_all(cells: Sequence[Cell], output: Path) -> None:
+    """Clear away what processes that are no more left, which shows that the folder can be written."""
+    _check_folder(output)
     try:
         output.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=output).close()
+        for cell in cells:
+            clean(cell, output)
     except OSError as error:
         raise ConfigError(
             f"Nothing can be written to {output} ({error.strerror}); choose another --output."
@@ -147,8 +161,8 @@ def _print_catalogue() -> None:
     print("\nsb3-ars bench table1 table4 --scale toy small --seeds 3; --help shows the options.")
 
 
-def _print_cells(cells: Sequence[Cell], output: Path, outcomes: Mapping[Cell, Outcome]) -> int:
-    """Print a row for each cell; return how many failed."""
+def _print_cells(cells: Sequence[Cell], output: Path, outcomes: Mapping[Cell, Outcome]) -> list[CellState]:
+    """Print a row for each cell; return their states."""
     table = Table("cell", "state", box=None, padding=(0, 1, 0, 0))
     table.add_column("minutes", justify="right")
     table.add_column("success", justify="right")
@@ -158,13 +172,14 @@ def _print_cells(cells: Sequence[Cell], output: Path, outcomes: Mapping[Cell, Ou
         minutes = success = ""
         if state == "finished":
             result = read_run(cell.folder(output)).result
-            minutes, success = f"{result['training_seconds'] / 60:.1f}", f"{result['mean_success']:.2f}"
+            minutes = f"{result['training_seconds'] / 60:.1f}"
+            success = "" if result["mean_success"] is None else f"{result['mean_success']:.2f}"
         error = outcomes[cell].error if cell in outcomes else ""
         table.add_row(cell.name, _COLOURS[state], minutes, success, escape(error))
     _console().print(table)
     counts = ", ".join(f"{states.count(state)} {state}" for state in _COLOURS if state in states)
     print(f"{_cells(len(cells))}: {counts}")
-    return sum(outcome.status == "failed" for outcome in outcomes.values())
+    return states
 
 
 _COLOURS = {
@@ -184,25 +199,30 @@ def _console() -> Console:
 
 
 @contextmanager
-def _monitor(total: int) -> Iterator[Monitor]:
+def _monitor(total: int, announcement: str) -> Iterator[Monitor]:
     """Show how a sweep goes on: bars on a terminal, a line for each cell that ended elsewhere."""
     console = Console(highlight=False)
     if not console.is_terminal:
-        yield _Lines(total)
+        yield _Lines(total, announcement)
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"))
     with Progress(*columns, console=console) as progress:
-        yield _Bars(total, progress)
+        yield _Bars(total, announcement, progress)
 
 
 class _Lines:
     """A line for each cell that ended.
 
     :param total: number of cells
+    :param announcement: to print before the first
     """
 
-    def __init__(self, total: int) -> None:
+    def __init__(self, total: int, announcement: str) -> None:
         self._total, self._ended, self._began = total, 0, time.monotonic()
+        self._announcement = announcement
+
+    def ready(self) -> None:
+        self.line(self._announcement)
 
     def started(self, cell: Cell) -> None:
         pass
@@ -223,11 +243,12 @@ class _Bars(_Lines):
     """A bar for the sweep and one for each cell at work, above them a line for each that ended.
 
     :param total: number of cells
+    :param announcement: to print above them
     :param progress: that draws them
     """
 
-    def __init__(self, total: int, progress: Progress) -> None:
-        super().__init__(total)
+    def __init__(self, total: int, announcement: str, progress: Progress) -> None:
+        super().__init__(total, announcement)
         self._progress = progress
         self._sweep = progress.add_task("sweep", total=total, state=f"0 of {_cells(total)}")
         self._tasks: dict[Cell, tuple[TaskID, float]] = {}

@@ -13,12 +13,14 @@ __all__ = ["main"]
 
 @dataclass(frozen=True)
 class _ReportArguments:
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Write tables and figures of runs as one HTML page, and the tables as CSV and Markdown."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")]
     """Folders of runs, or folders that hold runs."""
     output: Path = Path("report")
     """Folder of the report: index.html, and its tables as CSV and Markdown."""
-    sweeps: tuple[str, ...] = ()
-    """Tables and figures of the paper to show in their form, such as table1 fig5."""
+    sweeps: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: what fits the runs)")] = ()
+    """Tables and figures of the paper to show in their form, such as table1 fig5, or paths of YAML files."""
     videos: bool = False
     """Put the runs' videos into the page."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,28 +63,33 @@ def main(arguments: list[str]) -> int:
     """
     options = tyro.cli(_TuneArguments, prog="sb3-ars tune", description=_DESCRIPTION, args=arguments)
     # after the options are read: it loads torch
-    from sb3_ars.tuning import summarise, tune, write_results
+    from sb3_ars.tuning import summarise, tune, unused_seed, write_results
 
-    print(
-        f"Tuning {options.preset}: {options.n_trials} trials of {options.seeds} seeds. Ctrl-C ends the running trial; "
-        "the same command goes on.",
-        flush=True,
-    )
-    study = tune(
-        options.preset,
-        options.space,
-        n_trials=options.n_trials,
-        timeout=None if options.timeout is None else 60 * options.timeout,
-        n_seeds=options.seeds,
-        n_evaluations=options.evaluations,
-        pruner=options.pruner,
-        storage=options.storage,
-        name=options.study,
-        output=options.output,
-        scale=options.scale,
-        seed=options.sampler_seed,
-        callbacks=[_print_trial],
-    )
+    def announce(study: optuna.Study) -> None:
+        print(
+            f"Tuning {options.preset}, study {study.study_name}: {options.n_trials} trials of {options.seeds} seeds. "
+            "Ctrl-C ends the running trial; the same command goes on.",
+            flush=True,
+        )
+
+    with warnings.catch_warnings():
+        warnings.showwarning = _print_warning
+        study = tune(
+            options.preset,
+            options.space,
+            n_trials=options.n_trials,
+            timeout=None if options.timeout is None else 60 * options.timeout,
+            n_seeds=options.seeds,
+            n_evaluations=options.evaluations,
+            pruner=options.pruner,
+            storage=options.storage,
+            name=options.study,
+            output=options.output,
+            scale=options.scale,
+            seed=options.sampler_seed,
+            callbacks=[_print_trial],
+            before_first_trial=announce,
+        )
     folder = options.output / study.study_name
     summary = summarise(study)
     files, left_out = write_results(study, folder)
@@ -92,7 +99,10 @@ def main(arguments: list[str]) -> int:
         print(sentence)
     if not summary.tried:
         return 1
-    print(f"Train the best one with seeds of its own:\n  sb3-ars train {folder / 'best.yaml'}")
+    print(
+        f"Train the best one with a seed that no trial used, {unused_seed(study)} (for further runs add --seed with "
+        f"higher ones):\n  sb3-ars train {folder / 'best.yaml'}"
+    )
     return 0
 
 
@@ -121,6 +131,10 @@ def print_summary(summary: TuningSummary, n_seeds: int, n_best: int = 10) -> Non
     for number, why in summary.failures.items():
         print(f"Trial {number} failed: {why}")
     print(summary.verdict)
+
+
+def _print_warning(message: Warning | str, *where: Any, **more: Any) -> None:
+    print(f"warning: {message}", file=sys.stderr)
 
 
 def _print_trial(study: optuna.Study, trial: FrozenTrial) -> None:

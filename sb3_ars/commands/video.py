@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
+_DESCRIPTION = """Record what a finished run's policy does on a task, as an MP4 or GIF file. The episodes are the
+first ones of an evaluation with the same seed."""
+
 
 @dataclass(frozen=True)
 class _VideoArguments:
@@ -29,7 +32,7 @@ class _VideoArguments:
     size: int = 320
     """Width and height in pixels."""
     fps: int = 30
-    """Most frames per second; the video runs as fast as the simulated time all the same."""
+    """At most so many frames per second of simulated time; fewer make a smaller file, not a faster video."""
     sampled: bool = False
     """Sample actions instead of taking the mean ones."""
     seed: int = 0
@@ -43,7 +46,7 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
-    options = tyro.cli(_VideoArguments, prog="sb3-ars video", args=arguments)
+    options = tyro.cli(_VideoArguments, prog="sb3-ars video", description=_DESCRIPTION, args=arguments)
     # after the options are read: it loads torch
     from sb3_ars.video import record_run
 

@@ -6,14 +6,15 @@ name is finished, however the process that trained it ended::
     <output>/<scale>/<preset>/seed0             finished: exactly a run's folder
     <output>/<scale>/<preset>/seed1.running     in work, or left behind by a process that was killed
     <output>/<scale>/<preset>/seed2.failed      error.txt, log.txt and what the run had written; tried again next time
+    <output>/.lock                              held while one of these is made, renamed or removed
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
-import platform
 import shutil
 import signal
 import sys
@@ -25,11 +26,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import psutil
-
 from sb3_ars.errors import ConfigError, check_count, nearest
-from sb3_ars.experiments.config import RunConfig, build, load_preset, plain_values
-from sb3_ars.experiments.run_folder import RESULT, Run, is_finished, read_run, write_json
+from sb3_ars.experiments.config import NO_PART_OF_A_METHOD, RunConfig, build, load_preset, plain_values
+from sb3_ars.experiments.owner import host, lives, this_process
+from sb3_ars.experiments.run_folder import RESULT, Run, read_run, write_json
 from sb3_ars.experiments.scaling import Scale, load_scale, scaled
 from sb3_ars.experiments.sweeps import Sweep
 
@@ -40,22 +40,19 @@ __all__ = [
     "claim",
     "clean",
     "command",
-    "discard",
     "fail",
     "failed_folder",
     "log_file",
     "plan",
     "publish",
+    "release",
     "run_folder_of",
 ]
 
 CellState = Literal["missing", "finished", "failed", "running"]
 
-_UNCOMPARED = ("output", "verbose", "profile")  # they change nothing that a run learns
 _OWNER, _SPEC, _RUN, _LOG, _ERROR = "owner.json", "spec.json", "run", "log.txt", "error.txt"
-_YOUNG = (
-    30.0  # seconds in which a folder may lack its owner's name: it is written right after the folder is made
-)
+_LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -129,18 +126,22 @@ def cell_state(cell: Cell, output: Path) -> CellState:
 
     :param cell: of the sweep
     :param output: folder of the sweep
-    :raises ConfigError: if it is finished, but with another configuration
+    :raises ConfigError: if what lies in its place is no finished run of it, or one with another configuration
     """
-    folder = cell.folder(output)
-    if is_finished(folder):
+    folder, working = cell.folder(output), _working(cell, output)
+    if folder.exists():
+        if not _is_whole(folder):
+            raise ConfigError(
+                f"{folder} exists but holds no finished run, or one that was ended early, so {cell.name} cannot go "
+                "there; move it away, or choose another --output."
+            )
         _check_same(cell, read_run(folder))
         return "finished"
-    if folder.exists():
+    if working.exists() and not working.is_dir():
         raise ConfigError(
-            f"{folder} exists but holds no finished run, so {cell.name} cannot go there; move it away, or choose "
-            "another --output."
+            f"{working} is no folder, so {cell.name} cannot be trained there; move it away, or choose another --output."
         )
-    if _in_work(_working(cell, output)):
+    if _in_work(working):
         return "running"
     return "failed" if failed_folder(cell, output).exists() else "missing"
 
@@ -155,28 +156,30 @@ def failed_folder(cell: Cell, output: Path) -> Path:
     return folder.with_name(f"{folder.name}.failed")
 
 
-def claim(cell: Cell, output: Path) -> Path | None:
+def claim(cell: Cell, output: Path, cpus: int = 1) -> Path | None:
     """Make the folder that a cell is trained in, with what its process needs; return it.
 
     Leftovers of a process that was killed are removed first.
 
     :param cell: of the sweep
     :param output: folder of the sweep
+    :param cpus: cores of the cell; where the number of workers is auto, it is theirs, not the machine's
     :return: ``None`` if the cell is finished, or another process works on it
     """
-    folder = _working(cell, output)
-    clean(cell, output)
-    try:
-        folder.mkdir(parents=True)
-    except FileExistsError:
-        return None
-    if is_finished(cell.folder(output)):  # another process was quicker
-        discard(folder)
-        return None
-    write_json(folder / _OWNER, _owner())
-    spec = {"name": cell.name, "preset": cell.preset, "config": plain_values(cell.config)}
-    write_json(folder / _SPEC, spec)
-    return folder
+    working = _working(cell, output)
+    with _locked(output):
+        _clean(cell, output)
+        if cell.folder(output).exists() or working.exists():
+            return None
+        working.mkdir(parents=True)
+        try:
+            write_json(working / _OWNER, this_process())
+            config = plain_values(_with_workers(cell.config, cpus))
+            write_json(working / _SPEC, {"name": cell.name, "preset": cell.preset, "config": config})
+        except OSError:
+            _remove(working)
+            raise
+    return working
 
 
 def clean(cell: Cell, output: Path) -> None:
@@ -185,11 +188,8 @@ def clean(cell: Cell, output: Path) -> None:
     :param cell: of the sweep
     :param output: folder of the sweep
     """
-    folder = _working(cell, output)
-    if folder.exists() and not _in_work(folder):
-        if _is_whole(folder / _RUN):
-            publish(cell, output)
-        discard(folder)
+    with _locked(output):
+        _clean(cell, output)
 
 
 def command(working: Path) -> list[str]:
@@ -222,15 +222,20 @@ def publish(cell: Cell, output: Path) -> bool:
     :param cell: of the sweep
     :param output: folder of the sweep
     """
-    working, folder = _working(cell, output), cell.folder(output)
-    if not _is_whole(working / _RUN):
-        return False
-    if log_file(working).exists():
-        log_file(working).replace(working / _RUN / _LOG)
-    (working / _RUN).rename(folder)
-    shutil.rmtree(failed_folder(cell, output), ignore_errors=True)
-    discard(working)
-    return True
+    with _locked(output):
+        return _publish(cell, output)
+
+
+def release(cell: Cell, output: Path) -> None:
+    """Give up a folder that this process claimed: a run in it that is whole is kept, all else is removed.
+
+    :param cell: of the sweep
+    :param output: folder of the sweep
+    """
+    with _locked(output):
+        owner, me = _owner(_working(cell, output)), this_process()
+        if owner is not None and (owner["host"], owner["pid"]) == (me["host"], me["pid"]):
+            _release(cell, output)
 
 
 def fail(cell: Cell, output: Path, reason: str) -> str:
@@ -245,19 +250,13 @@ def fail(cell: Cell, output: Path, reason: str) -> str:
         said = _last_line(log_file(working))
         text = f"{reason}; the last line of its log: {said}" if said else reason
         (working / _ERROR).write_text(f"{text}\n", encoding="utf-8")
-    (working / _RUN / RESULT).unlink(missing_ok=True)  # nobody is to read it as finished
-    (working / _OWNER).unlink(missing_ok=True)
-    shutil.rmtree(failed, ignore_errors=True)
-    working.rename(failed)
-    return _last_line(failed / _ERROR)
-
-
-def discard(working: Path) -> None:
-    """Remove a claimed folder.
-
-    :param working: what :func:`claim` returned
-    """
-    shutil.rmtree(working, ignore_errors=True)
+    error = _last_line(working / _ERROR)
+    with _locked(output):
+        (working / _RUN / RESULT).unlink(missing_ok=True)  # nobody is to read it as finished
+        (working / _OWNER).unlink(missing_ok=True)
+        _remove(failed)
+        working.rename(failed)
+    return error
 
 
 # ---------------------------------------------------------------------- the process of a cell
@@ -307,28 +306,66 @@ def _working(cell: Cell, output: Path) -> Path:
     return folder.with_name(f"{folder.name}.running")
 
 
-def _owner() -> dict[str, Any]:
-    return {
-        "host": platform.node(),
-        "pid": os.getpid(),
-        "started": psutil.Process().create_time(),
-    }
+@contextlib.contextmanager
+def _locked(output: Path) -> Iterator[None]:
+    """Let no other process change what lies in a sweep's folder: looking and acting are to be one step."""
+    output.mkdir(parents=True, exist_ok=True)
+    with (output / _LOCK).open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield  # the lock ends with the file, however this process ends
+
+
+def _owner(working: Path) -> Mapping[str, Any] | None:
+    """Return what tells the process that made the folder, ``None`` if it was killed before it had written it."""
+    try:
+        owner = json.loads((working / _OWNER).read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return None
+    whole = isinstance(owner, Mapping) and {"host", "pid", "started"} <= owner.keys()
+    return owner if whole else None
 
 
 def _in_work(working: Path) -> bool:
     """Return whether the process that made the folder may still work on it."""
-    try:
-        owner = json.loads((working / _OWNER).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        with contextlib.suppress(FileNotFoundError):
-            return time.time() - working.stat().st_mtime < _YOUNG
+    owner = _owner(working)
+    if owner is None:
         return False
-    if owner["host"] != platform.node():
-        return True  # nobody here can know
-    try:
-        return bool(abs(psutil.Process(owner["pid"]).create_time() - owner["started"]) < 1.0)
-    except psutil.NoSuchProcess:
+    # of another machine's process nobody here can know
+    return owner["host"] != host() or lives(owner["pid"], owner["started"]) is True
+
+
+def _clean(cell: Cell, output: Path) -> None:
+    if not _in_work(_working(cell, output)):
+        _release(cell, output)
+
+
+def _release(cell: Cell, output: Path) -> None:
+    if not _publish(cell, output):
+        _remove(_working(cell, output))
+
+
+def _publish(cell: Cell, output: Path) -> bool:
+    working, folder = _working(cell, output), cell.folder(output)
+    if not _is_whole(working / _RUN) or folder.exists():
         return False
+    if log_file(working).exists():
+        log_file(working).replace(working / _RUN / _LOG)
+    (working / _RUN).rename(folder)
+    _remove(failed_folder(cell, output))
+    _remove(working)
+    return True
+
+
+def _remove(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _with_workers(config: RunConfig, cpus: int) -> RunConfig:
+    """Return the configuration with as many workers as a cell has cores for, where it leaves their number open."""
+    if config.env.n_workers != "auto":
+        return config
+    workers = min(cpus, len(config.env.task_names))
+    return replace(config, env=replace(config.env, n_workers=workers if workers > 1 else 0))
 
 
 def _last_line(path: Path) -> str:
@@ -340,21 +377,27 @@ def _last_line(path: Path) -> str:
 
 def _is_whole(run: Path) -> bool:
     """Return whether a run came to its end, and was not ended early."""
-    if not is_finished(run):
+    try:
+        result = json.loads((run / RESULT).read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return False
-    result = json.loads((run / RESULT).read_text(encoding="utf-8"))
-    return not bool(result.get("interrupted"))
+    return isinstance(result, Mapping) and not result.get("interrupted")
 
 
 def _check_same(cell: Cell, run: Run) -> None:
     """Raise if the run is not what the cell is to be."""
+    remedy = "delete the folder to train it anew, or choose another --output."
+    if (run.config.scale, run.name, run.seed) != (cell.scale, cell.preset, cell.seed):
+        raise ConfigError(
+            f"{run.folder} holds a run of {run.config.scale}/{run.name}/seed{run.seed}, not of {cell.name}; {remedy}"
+        )
     differences = list(_differences(plain_values(run.config), plain_values(cell.config)))
     if differences:
         option, there, wanted = differences[0]
-        others = f" and {len(differences) - 1} more options differ" if len(differences) > 1 else ""
+        others = f" (differing options in all: {len(differences)})" if len(differences) > 1 else ""
         raise ConfigError(
             f"{run.folder} holds a run with {option}={there!r}, but {cell.name} is now to have {wanted!r}{others}; "
-            "delete the folder to train it anew, or choose another --output."
+            + remedy
         )
 
 
@@ -363,7 +406,7 @@ def _differences(
 ) -> Iterator[tuple[str, Any, Any]]:
     for key in dict.fromkeys([*there, *wanted]):
         before, now = there.get(key), wanted.get(key)
-        if not part and key in _UNCOMPARED:
+        if f"{part}{key}" in NO_PART_OF_A_METHOD:
             continue
         if isinstance(before, Mapping) and isinstance(now, Mapping):
             yield from _differences(before, now, f"{part}{key}.")

@@ -19,6 +19,7 @@ from sb3_ars.errors import ConfigError, check_count, nearest
 from sb3_ars.experiments.catalogue import preset_values
 
 __all__ = [
+    "NO_PART_OF_A_METHOD",
     "AlgorithmConfig",
     "EnvConfig",
     "EvaluationConfig",
@@ -29,6 +30,7 @@ __all__ = [
     "load_config",
     "load_preset",
     "plain_values",
+    "read_yaml",
     "save_config",
     "with_options",
 ]
@@ -38,6 +40,19 @@ Body = Literal["plain", "multi_head", "soft_modules", "moore", "paco"]
 CriticBody = Literal["same", "plain", "multi_head", "soft_modules", "moore", "paco", "popart"]
 BodyOptions = dict[str, int | float | bool]
 Config = TypeVar("Config")
+
+NO_PART_OF_A_METHOD = (
+    "seed",
+    "output",
+    "scale",
+    "log_interval",
+    "verbose",
+    "profile",
+    "env.n_workers",
+    "evaluation.every",
+)
+"""Options in which runs of one method may differ: which run it is, where it goes, how often it is looked at, and by
+how many processes its environments are stepped."""
 
 
 @dataclass(frozen=True)
@@ -240,13 +255,27 @@ def load_config(path: Path) -> RunConfig:
     """
     if not path.is_file():
         raise ConfigError(f"{path} does not exist; the folder of a run holds one, config.yaml.")
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not valid YAML: {error}") from error
+    values = read_yaml(path, str(path))
     if not isinstance(values, Mapping):
         raise ConfigError(f"{path} is not the configuration of a run.")
     return build(RunConfig, values, str(path))
+
+
+def read_yaml(source: Path | str, where: str) -> Any:
+    """Return what a YAML file or text holds.
+
+    :param source: path of the file, or the text itself
+    :param where: it comes from, for messages
+    :raises ConfigError: in one line, if it cannot be read, is not UTF-8 or not YAML
+    """
+    try:
+        return yaml.safe_load(source.read_text(encoding="utf-8") if isinstance(source, Path) else source)
+    except OSError as error:
+        raise ConfigError(f"{where} cannot be read ({error.strerror}).") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{where} is no text in UTF-8; save it as that.") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where} is not valid YAML: {' '.join(str(error).split())}") from error
 
 
 def with_options(config: RunConfig, options: Mapping[str, Any], where: str) -> RunConfig:

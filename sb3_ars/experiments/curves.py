@@ -83,7 +83,7 @@ def scale_curves(runs: Sequence[Run]) -> Curves:
     """
     histories = [run.result["reward_scale_history"] for run in runs]
     if not all(histories):
-        return Curves(np.empty(0), np.empty((len(runs), 0, 0)))
+        return Curves(np.empty(0), np.empty((len(runs), 0, len(runs[0].task_names))))
     starts = sorted({time for history in histories for time, _ in history})
     first = max(history[0][0] for history in histories)
     end = max(run.result["timesteps"] for run in runs)

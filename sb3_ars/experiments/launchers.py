@@ -49,11 +49,14 @@ class Outcome:
 class Monitor(Protocol):
     """Is told how a sweep goes on."""
 
+    def ready(self) -> None:
+        """Take note that what trains the cells is there."""
+
     def started(self, cell: Cell) -> None:
-        """Take note that a cell is being trained."""
+        """Take note that a cell is being trained; a cluster does not tell, and so it is not called."""
 
     def progressed(self, cell: Cell, steps: int) -> None:
-        """Take note of the environment steps that a cell has made."""
+        """Take note of the environment steps that a started cell has made."""
 
     def ended(self, outcome: Outcome) -> None:
         """Take note of what became of a cell."""
@@ -99,19 +102,24 @@ class LocalLauncher:
             outcomes.append(outcome)
             monitor.ended(outcome)
 
+        def start(cell: Cell) -> None:
+            folder = disk.claim(cell, output, self.cpus_per_cell)
+            if folder is None:
+                return end(Outcome(cell, "elsewhere"))
+            variables = _threads(self.cpus_per_cell) | _gpu(gpus, free[0])
+            working[_Process(folder, variables)] = (cell, free.popleft())
+            monitor.started(cell)
+
+        monitor.ready()
         with _sigterm_interrupts():
             try:
                 while waiting or working:
                     while waiting and free:
                         cell = waiting.popleft()
-                        folder = disk.claim(cell, output)
-                        if folder is None:
-                            end(Outcome(cell, "elsewhere"))
-                            continue
-                        place = free.popleft()
-                        variables = _threads(self.cpus_per_cell) | _gpu(gpus, place)
-                        working[_Process(folder, variables)] = (cell, place)
-                        monitor.started(cell)
+                        try:
+                            start(cell)
+                        except OSError as error:
+                            end(_unwritten(error, cell, output))
                     time.sleep(_POLL)
                     for process in [process for process in working if process.ended()]:
                         cell, place = working.pop(process)
@@ -120,9 +128,9 @@ class LocalLauncher:
                     for process, (cell, _) in working.items():
                         monitor.progressed(cell, _steps(process.folder))
             finally:
-                for process in working:  # of a sweep that was interrupted
+                for process, (cell, _) in working.items():  # of a sweep that was interrupted
                     process.stop()
-                    disk.discard(process.folder)
+                    _given_up(cell, output)
         return outcomes
 
 
@@ -154,6 +162,11 @@ class RayLauncher:
         """Train cells; see :class:`Launcher`."""
         ray = _ray()
         outcomes, waiting = list[Outcome](), dict[Any, tuple[Cell, Path]]()
+
+        def end(outcome: Outcome) -> None:
+            outcomes.append(outcome)
+            monitor.ended(outcome)
+
         with _connected(ray, self.address), _sigterm_interrupts():
             _check_resources(ray, self.cpus_per_cell, self.gpus_per_cell)
             task = ray.remote(_train_on_node).options(
@@ -162,26 +175,31 @@ class RayLauncher:
                 max_retries=self.retries,
                 scheduling_strategy="SPREAD",
             )
+
+            def gather(timeout: float) -> None:
+                done, _ = ray.wait(list(waiting), num_returns=len(waiting), timeout=timeout)
+                for reference in done:
+                    end(_gathered(ray, reference, *waiting.pop(reference), output))
+
+            monitor.ready()
             try:
                 for cell in cells:
-                    folder = disk.claim(cell, output)
-                    if folder is None:
-                        outcomes.append(Outcome(cell, "elsewhere"))
-                        monitor.ended(outcomes[-1])
-                        continue
-                    files = _packed(folder)
-                    waiting[task.remote(files, self.cpus_per_cell)] = (cell, folder)
-                    monitor.started(cell)
+                    try:
+                        folder = disk.claim(cell, output, self.cpus_per_cell)
+                        if folder is None:
+                            end(Outcome(cell, "elsewhere"))
+                            continue
+                        waiting[task.remote(_packed(folder), self.cpus_per_cell)] = (cell, folder)
+                    except OSError as error:
+                        end(_unwritten(error, cell, output))
                 while waiting:
-                    done, _ = ray.wait(list(waiting), timeout=1.0)
-                    for reference in done:
-                        cell, folder = waiting.pop(reference)
-                        outcomes.append(_gathered(ray, reference, cell, folder, output))
-                        monitor.ended(outcomes[-1])
+                    gather(timeout=1.0)
             finally:
-                for reference, (_, folder) in waiting.items():  # of a sweep that was interrupted
+                if waiting:  # of a sweep that was interrupted
+                    gather(timeout=0.0)
+                for reference, (cell, _) in waiting.items():
                     ray.cancel(reference, force=True)
-                    disk.discard(folder)
+                    _given_up(cell, output)
         return outcomes
 
 
@@ -190,9 +208,12 @@ class RayLauncher:
 
 @dataclass(frozen=True)
 class _Ending:
-    """How the process of a cell ended."""
+    """How the process of a cell ended.
 
-    succeeded: bool
+    :param reason: why there is no finished run, if there is none
+    :param seconds: it took
+    """
+
     reason: str
     seconds: float
 
@@ -227,12 +248,10 @@ class _Process:
         seconds = time.monotonic() - self._began
         self.stop()  # workers that outlived a process that was killed
         if code >= 0:
-            return _Ending(
-                code == 0, f"the process ended with status {code} and left no finished run", seconds
-            )
+            return _Ending(f"the process ended with status {code} and left no finished run", seconds)
         name = signal.Signals(-code).name
         hint = "; out of memory?" if name == "SIGKILL" else ""
-        return _Ending(False, f"the process was killed by {name}{hint}", seconds)
+        return _Ending(f"the process was killed by {name}{hint}", seconds)
 
     def stop(self) -> None:
         """End the process and those it started."""
@@ -245,9 +264,23 @@ class _Process:
 
 def _named(ending: _Ending, cell: Cell, output: Path) -> Outcome:
     """Name a cell's folder after what became of it; return that."""
-    if ending.succeeded and disk.publish(cell, output):
-        return Outcome(cell, "finished", ending.seconds)
-    return Outcome(cell, "failed", ending.seconds, disk.fail(cell, output, ending.reason))
+    try:
+        if disk.publish(cell, output):  # whatever its process died of after that
+            return Outcome(cell, "finished", ending.seconds)
+        return Outcome(cell, "failed", ending.seconds, disk.fail(cell, output, ending.reason))
+    except OSError as error:
+        return _unwritten(error, cell, output, ending.seconds)
+
+
+def _unwritten(error: OSError, cell: Cell, output: Path, seconds: float = 0.0) -> Outcome:
+    """Return what became of a cell whose folder cannot be written or is gone."""
+    _given_up(cell, output)
+    return Outcome(cell, "failed", seconds, f"{type(error).__name__}: {error}")
+
+
+def _given_up(cell: Cell, output: Path) -> None:
+    with contextlib.suppress(OSError):  # of a full disk, and it is cleared away next time
+        disk.release(cell, output)
 
 
 def _threads(count: int) -> dict[str, str]:
@@ -353,8 +386,11 @@ def _gathered(ray: Any, reference: Any, cell: Cell, working: Path, output: Path)
         ending, files = ray.get(reference)
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines() or [""]
-        return _named(_Ending(False, f"{type(error).__name__}: {lines[0]}", 0.0), cell, output)
-    _unpack(files, working)
+        return _named(_Ending(f"{type(error).__name__}: {lines[0]}", 0.0), cell, output)
+    try:
+        _unpack(files, working)
+    except OSError as error:
+        return _unwritten(error, cell, output, ending.seconds)
     return _named(ending, cell, output)
 
 

@@ -24,6 +24,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from sb3_ars.algorithms.task_log import log_names
+from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.curves import (
     Curves,
     Source,
@@ -174,7 +175,7 @@ def plot_task_curves(
     """
     source = source or common_source(_all_runs(arms))
     found = {label: success_curves(runs, source) for label, runs in arms.items()}
-    names = _all_runs(arms)[0].task_names
+    names = _task_names(arms)
     panels = {
         short(name): {label: Curves(c.steps, c.values[..., [task]]) for label, c in found.items()}
         for task, name in enumerate(names)
@@ -222,7 +223,7 @@ def curve_panels(
 def plot_scales(arms: Arms, width: float = _WIDE) -> Figure:
     """Draw c_i of every task over training on a log scale: the geometric mean over seeds, and their range as a band.
 
-    :param arms: label -> runs of one method
+    :param arms: label -> runs of one method, all on the same tasks
     :param width: in inches
     """
     found = {label: scale_curves(runs) for label, runs in arms.items()}
@@ -232,7 +233,7 @@ def plot_scales(arms: Arms, width: float = _WIDE) -> Figure:
 def plot_q_values(arms: Arms, tasks: Sequence[str] | None = None, width: float = _WIDE) -> Figure:
     """Draw the critics' mean value of every task over training: the mean over seeds, one standard deviation as a band.
 
-    :param arms: label -> runs of one method
+    :param arms: label -> runs of one method, all on the same tasks
     :param tasks: to show; ``None`` shows all
     :param width: in inches
     """
@@ -248,7 +249,7 @@ def plot_task_success(arms: Arms, width: float = _WIDE, numbers: Mapping[str, in
     :param numbers: label -> index of its :func:`series_style`; ``None`` counts them
     """
     numbers = numbers or _counted(arms)
-    names = [short(name) for name in _all_runs(arms)[0].task_names]
+    names = [short(name) for name in _task_names(arms)]
     scores = {label: 100 * _scores(runs) for label, runs in arms.items()}
     bars = len(names) * len(arms) <= _BARS
     pitch = max(0.3, 0.13 * len(arms) + 0.1) if bars else 0.22
@@ -426,7 +427,7 @@ def _task_panels(
     shown: Sequence[str] | None = None,
 ) -> Figure:
     """Draw a panel for each method, with a curve for each task."""
-    names = _all_runs(arms)[0].task_names
+    names = _task_names(arms)
     last = max((curves.steps[-1] for curves in found.values() if len(curves.steps)), default=1.0)
     unit, divisor = _step_unit(last)
     tasks = [task for task, name in enumerate(names) if shown is None or name in shown]
@@ -597,6 +598,17 @@ def _counted(labels: Iterable[str]) -> dict[str, int]:
 
 def _all_runs(arms: Arms) -> list[Run]:
     return [run for runs in arms.values() for run in runs]
+
+
+def _task_names(arms: Arms) -> tuple[str, ...]:
+    """Return the tasks that all of the runs have."""
+    names = list(dict.fromkeys(run.task_names for run in _all_runs(arms)))
+    if len(names) > 1:
+        raise ConfigError(
+            f"Runs of other tasks cannot stand in one figure of tasks: {'; '.join(map(', '.join, names))}. Draw a "
+            "figure for each."
+        )
+    return names[0]
 
 
 def _scores(runs: Sequence[Run]) -> Array:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ import pandas as pd
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.config import RunConfig, load_config
 
-__all__ = ["FORMAT", "RESULT", "Run", "find_runs", "is_finished", "read_run", "write_json"]
+__all__ = ["FORMAT", "RESULT", "Run", "find_runs", "is_finished", "read_run", "write_json", "write_whole"]
 
 FORMAT = 1
 """Version of the folder's layout; a change that an older reader would misread raises it."""
@@ -79,9 +82,9 @@ class Run:
         if not path.is_file():
             return None
         try:
-            with np.load(path) as arrays:
+            with path.open("rb") as file, np.load(file) as arrays:  # numpy leaves open what it cannot read
                 return arrays["timesteps"].astype(np.int64), arrays["successes"].mean(axis=2)
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ConfigError(f"{path} cannot be read: {error}") from error
 
 
@@ -123,11 +126,30 @@ def read_run(folder: Path) -> Run:
             f"{folder} has run format {result.get('format')!r}, but this version of sb3_ars reads format {FORMAT}; "
             "read it with the version in its versions.json, or train it again."
         )
-    missing = {"name", "mean_success", "tasks", "reward_scale_history", "timesteps"} - result.keys()
-    if missing:
-        raise ConfigError(f"{folder / RESULT} lacks {', '.join(sorted(missing))}; train the run again.")
+    _check_result(folder / RESULT, result)
     config = load_config(folder / "config.yaml")
     return Run(folder, result["name"], config, result, _read_json(folder / "versions.json"))
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file or folder whole or not at all: a reader never meets half of it, and a failure leaves nothing.
+
+    :param path: to write; what is there already is replaced
+    :param write: writes it under the path it is given, a hidden one beside it with the same suffix
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        write(temporary)
+        if temporary.is_file():
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())  # else a power cut could leave the name with nothing behind it
+        temporary.replace(path)
+    except BaseException:  # an interrupt too
+        if temporary.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
+        raise
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -136,12 +158,8 @@ def write_json(path: Path, value: Any) -> None:
     :param path: file to write
     :param value: anything JSON holds
     """
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(json.dumps(value, indent=2) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    text = json.dumps(value, indent=2) + "\n"
+    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -152,3 +170,66 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(f"{path} is not what a run writes: it holds no mapping.")
     return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_rate(value: Any) -> bool:
+    return value is None or _is_number(value)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _are_tasks(value: Any) -> bool:
+    rates = ("success", "success_sampled")
+    return isinstance(value, dict) and all(
+        isinstance(task, dict) and all(rate in task and _is_rate(task[rate]) for rate in rates)
+        for task in value.values()
+    )
+
+
+def _is_scale_history(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(entry, list)
+        and len(entry) == 2
+        and _is_number(entry[0])
+        and isinstance(entry[1], list)
+        and all(map(_is_number, entry[1]))
+        for entry in value
+    )
+
+
+def _are_seconds(value: Any) -> bool:
+    return value is None or (isinstance(value, dict) and all(map(_is_number, value.values())))
+
+
+_FORM: Mapping[str, tuple[Callable[[Any], bool], str]] = {
+    "name": (lambda value: isinstance(value, str), "a text"),
+    "mean_success": (_is_rate, "a number, or null where no task reports success"),
+    "tasks": (_are_tasks, "success and success_sampled, a number or null, of each task by name"),
+    "reward_scale_history": (_is_scale_history, "a list of [environment steps, [c_i of every task]]"),
+    "timesteps": (_is_count, "a whole number"),
+    "training_seconds": (_is_number, "a number"),
+    "protocol": (lambda value: isinstance(value, str), "a text"),
+    "updates": (_is_count, "a whole number"),
+    "resets": (_is_count, "a whole number"),
+    "seconds_by_part": (_are_seconds, "seconds by name of the part, or null"),
+}
+"""What ``result.json`` holds, beside what nobody reads back."""
+
+_NEEDED = ("name", "mean_success", "tasks", "reward_scale_history", "timesteps", "training_seconds")
+
+
+def _check_result(path: Path, result: Mapping[str, Any]) -> None:
+    missing = [key for key in _NEEDED if key not in result]
+    if missing:
+        raise ConfigError(f"{path} lacks {', '.join(missing)}; train the run again.")
+    for key, (holds, what) in _FORM.items():
+        if key in result and not holds(result[key]):
+            raise ConfigError(
+                f"{path}: {key} is {repr(result[key])[:60]}, but must be {what}; train the run again."
+            )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import time
 from contextlib import ExitStack, closing
@@ -339,9 +338,12 @@ def _result(
         "format": FORMAT,
         "name": name,
         "seed": config.seed,
-        "mean_success": float(table["success"].mean()),
-        "mean_success_sampled": float(table["success_sampled"].mean()),
-        "tasks": json.loads(table.to_json(orient="index")),
+        "mean_success": _json_number(table["success"].mean()),
+        "mean_success_sampled": _json_number(table["success_sampled"].mean()),
+        "tasks": {
+            str(task): {str(column): _json_number(value) for column, value in values.items()}
+            for task, values in table.iterrows()
+        },
         "protocol": protocol.describe(),
         "timesteps": model.num_timesteps,
         "updates": model._n_updates,
@@ -351,6 +353,11 @@ def _result(
         "seconds_by_part": seconds_by_part,
         "interrupted": interrupted,
     }
+
+
+def _json_number(value: float) -> float | None:
+    """Return a number as JSON can hold it, in full precision; ``None`` for NaN, a success that no task reports."""
+    return None if pd.isna(value) else float(value)
 
 
 def _free_folder(stem: Path) -> Path:

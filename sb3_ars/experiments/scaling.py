@@ -10,11 +10,17 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from sb3_ars.config import ARSConfig
 from sb3_ars.errors import ConfigError, check_count, nearest
-from sb3_ars.experiments.config import EnvConfig, PolicyConfig, RunConfig, ScheduleConfig, build, with_options
+from sb3_ars.experiments.config import (
+    EnvConfig,
+    PolicyConfig,
+    RunConfig,
+    ScheduleConfig,
+    build,
+    read_yaml,
+    with_options,
+)
 from sb3_ars.nets.bodies import BODIES, body_config
 from sb3_ars.nets.lora import LoRAConfig
 
@@ -36,6 +42,12 @@ CAPS = {
 
 _COUNTS = ("random_steps", "updates_after_reset", "schedule_interval")
 """Options of a scale that grow with its length."""
+
+_EXAMPLES = {
+    "stands_for": "{push-v3: door-close-v3}",
+    "at_most": "{hidden_width: 64}",
+    "options": "{env: {n_workers: 0}}",
+}
 
 _NOT_A_SCALES = {  # what makes a preset what it is, what a scale has a field for, and what belongs to one run
     "": ("seed", "output", "log_interval", "scale"),
@@ -91,6 +103,14 @@ class Scale:
             if getattr(self, option) is not None:
                 minimum = 0 if option in ("evaluations", "updates_after_reset") else 1
                 check_count(f"scale {self.name}: {option}", getattr(self, option), minimum)
+        for option in ("stands_for", "at_most", "options"):
+            if not isinstance(getattr(self, option), Mapping):
+                raise ConfigError(
+                    f"scale {self.name}: {option}={getattr(self, option)!r} must be a mapping, such as "
+                    f"{_EXAMPLES[option]}."
+                )
+        if not isinstance(self.description, str):
+            raise ConfigError(f"scale {self.name}: description={self.description!r} must be a line of text.")
         _check_tasks(self)
         _check_resets(self)
         _check_caps(self)
@@ -129,7 +149,7 @@ def load_scale(name: str) -> Scale:
     """
     path = Path(name)
     if path.suffix in (".yaml", ".yml") and path.is_file():
-        return _read(path.stem, path.read_text(encoding="utf-8"), str(path))
+        return _read(path.stem, path, str(path))
     names = scale_names()
     if name not in names:
         raise ConfigError(
@@ -268,11 +288,8 @@ def _capped(scale: Scale, name: str, value: Any) -> Any:
 # ---------------------------------------------------------------------- reading and checking
 
 
-def _read(name: str, text: str, where: str) -> Scale:
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where} is not valid YAML: {error}") from error
+def _read(name: str, source: Path | str, where: str) -> Scale:
+    values = read_yaml(source, where)
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where} must be a mapping of a scale's options, not {values!r}.")
     return build(Scale, {"name": name, **values}, where)
@@ -283,6 +300,11 @@ def _check_tasks(scale: Scale) -> None:
         if scale.stands_for:
             raise ConfigError(f"scale {scale.name}: stands_for goes with tasks; name them, or drop it.")
         return
+    given: Any = scale.tasks  # of whatever type a file gives
+    if not all(isinstance(task, str) for task in (given if isinstance(given, tuple) else (given,))):
+        raise ConfigError(
+            f"scale {scale.name}: tasks={scale.tasks!r} must be a benchmark's name or a list of tasks."
+        )
     tasks = EnvConfig(tasks=scale.tasks).task_names
     for task, stand_in in scale.stands_for.items():
         if stand_in not in tasks:
@@ -325,7 +347,7 @@ def _check_options(scale: Scale) -> None:
     where = f"scale {scale.name}"
     with_options(RunConfig(), scale.options, where)  # unknown names and values
     for part, names in _NOT_A_SCALES.items():
-        given = scale.options if not part else scale.options.get(part, {})
+        given = scale.options if not part else scale.options.get(part) or {}
         for name in names:
             if name in given:
                 raise ConfigError(

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from sb3_ars.errors import ConfigError, nearest
 from sb3_ars.experiments.catalogue import preset_names
+from sb3_ars.experiments.config import read_yaml
 
 __all__ = ["KINDS", "Sweep", "SweepRow", "load_sweep", "sweep_names"]
 
@@ -101,7 +100,7 @@ def load_sweep(name: str) -> Sweep:
     """
     path = Path(name)
     if path.suffix in (".yaml", ".yml") and path.is_file():
-        return _sweep(path.stem, path.read_text(encoding="utf-8"), str(path))
+        return _sweep(path.stem, path, str(path))
     names = sweep_names()
     if name not in names:
         raise ConfigError(
@@ -111,24 +110,26 @@ def load_sweep(name: str) -> Sweep:
     return _sweep(name, (SWEEPS / f"{name}.yaml").read_text(encoding="utf-8"), f"sweep {name!r}")
 
 
-def _sweep(name: str, text: str, where: str) -> Sweep:
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where} is not valid YAML: {error}") from error
+def _sweep(name: str, file: Path | str, where: str) -> Sweep:
+    values = read_yaml(file, where)
     _check_keys(values, where, ("title", "source", "kind", "rows"), ("options",))
     kind, options = values["kind"], values.get("options") or {}
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ConfigError(
             f"{where}: kind={kind!r} is unknown; choose one of {', '.join(KINDS)}.{nearest(str(kind), KINDS)}"
         )
     _check_keys(options, f"{where}: options", (), (*_OPTIONS.get(kind, ()), "note"))
+    for option, value in options.items():
+        allowed, fits = _TYPES[option]
+        if not fits(value):
+            raise ConfigError(f"{where}: option {option}={value!r} must be {allowed}.")
     if not isinstance(values["rows"], list) or not values["rows"]:
         raise ConfigError(
             f"{where}: rows={values['rows']!r} must be a list of rows, each with preset and label."
         )
     rows = tuple(_row(row, f"{where}: row {number}") for number, row in enumerate(values["rows"], start=1))
-    return Sweep(name, values["title"], values["source"], kind, rows, options)
+    title, source = (_text(values[key], f"{where}: {key}") for key in ("title", "source"))
+    return Sweep(name, title, source, kind, rows, options)
 
 
 def _row(values: Any, where: str) -> SweepRow:
@@ -139,8 +140,63 @@ def _row(values: Any, where: str) -> SweepRow:
             f"{where}: there is no preset {values['preset']!r}.{nearest(str(values['preset']), presets)} "
             "'sb3-ars list' shows all."
         )
-    _check_keys(values.get("paper", {}), f"{where}: paper", (), _PAPER)
-    return SweepRow(**values)
+    label = _text(values["label"], f"{where}: label")
+    column = values.get("column")
+    column = None if column is None else _text(column, f"{where}: column")
+    return SweepRow(values["preset"], label, column, _paper(values.get("paper") or {}, f"{where}: paper"))
+
+
+def _paper(values: Any, where: str) -> dict[str, Any]:
+    _check_keys(values, where, (), _PAPER)
+    paper: dict[str, Any] = {}
+    for key, value in values.items():
+        here = f"{where}: {key}"
+        if key == "tasks":
+            if not isinstance(value, list):
+                raise ConfigError(
+                    f"{here}={value!r} must be a list with a number such as '97.3 ± 2.1' per task."
+                )
+            paper[key] = [_text(printed, here) for printed in value]
+        elif key == "bottom_k":
+            if not isinstance(value, Mapping) or not all(map(_is_count, value)):
+                raise ConfigError(f"{here}={value!r} must be a mapping such as {{10: '0.0 ± 0.0'}}.")
+            paper[key] = {k: _text(printed, here) for k, printed in value.items()}
+        else:
+            paper[key] = _text(value, here)
+    return paper
+
+
+def _text(value: Any, where: str) -> str:
+    """Return what a file gives as text; YAML reads one that looks like a number as a number."""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise ConfigError(f"{where}={value!r} must be text.")
+    return str(value)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+
+
+def _is_share(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= 1
+
+
+def _is_list_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and len(value) > 0 and all(map(fits, value))
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+_TYPES: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "ks": ("a list of integers of at least 1, such as [10, 20]", _is_list_of(_is_count)),
+    "thresholds": ("a list of shares from 0 to 1, such as [0.5, 0.9]", _is_list_of(_is_share)),
+    "n_easy": ("an integer of at least 1", _is_count),
+    "tasks": ("a list of tasks' names", _is_list_of(_is_text)),
+    "each_seed": ("true or false", lambda value: isinstance(value, bool)),
+    "note": ("a sentence", _is_text),
+}
 
 
 def _check_keys(values: Any, where: str, needed: Iterable[str], others: Iterable[str]) -> None:

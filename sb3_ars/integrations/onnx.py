@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import logging
-import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from torch import nn
 
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.errors import ConfigError
+from sb3_ars.experiments.run_folder import write_whole
 from sb3_ars.nets.mlp import set_arithmetic
 from sb3_ars.nets.moore import MOORE
 
@@ -138,12 +138,8 @@ def _quiet() -> Iterator[None]:
 
 
 def _write(path: Path, content: bytes) -> Path:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        temporary.write_bytes(content)
-        temporary.replace(path)
+        write_whole(path, lambda temporary: temporary.write_bytes(content))
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True) if temporary.parent.is_dir() else None
     return path

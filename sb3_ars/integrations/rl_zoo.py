@@ -91,6 +91,23 @@ class MultiTaskExperimentManager(ExperimentManager):  # type: ignore[misc]  # RL
             self.vec_env_class = plain
         return env
 
+    def hyperparameters_optimization(self) -> None:
+        """Run RL Zoo's study.
+
+        :raises ConfigError: if none of its trials came to its end
+        """
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:
+            if "No trials are completed yet" not in str(
+                error
+            ):  # Optuna's words, when RL Zoo asks for the best one
+                raise
+            raise ConfigError(
+                "No trial of the study came to its end: each was pruned or failed, and said why above. Give more "
+                "--n-trials, or other options."
+            ) from None
+
 
 class _Tasks(TaskIdWrapper):
     """Several tasks in a VecEnv of RL Zoo's.
@@ -175,4 +192,5 @@ if __name__ == "__main__":
     try:
         main()
     except ConfigError as _error:
-        sys.exit(f"error: {_error}")
+        print(f"error: {_error}", file=sys.stderr)
+        sys.exit(2)

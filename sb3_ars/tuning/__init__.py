@@ -2,7 +2,7 @@
 
 from sb3_ars.tuning.liveness import fail_dead_trials
 from sb3_ars.tuning.objective import TrialFailed, make_objective
-from sb3_ars.tuning.results import TuningSummary, summarise, write_results
+from sb3_ars.tuning.results import TuningSummary, summarise, unused_seed, write_results
 from sb3_ars.tuning.sampler import NumberedTPESampler
 from sb3_ars.tuning.search_space import SearchSpace, TunedOption, load_search_space, search_space_names
 from sb3_ars.tuning.study import make_pruner, tune
@@ -20,5 +20,6 @@ __all__ = [
     "search_space_names",
     "summarise",
     "tune",
+    "unused_seed",
     "write_results",
 ]

@@ -5,18 +5,16 @@ Optuna's own heartbeat exists for databases only. This one is two attributes of 
 
 from __future__ import annotations
 
-import os
-import platform
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import optuna
-import psutil
 from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
+
+from sb3_ars.experiments.owner import host, lives, this_process
 
 __all__ = [
     "HEARTBEAT_LIMIT",
@@ -33,7 +31,6 @@ HEARTBEAT_LIMIT = 600.0
 """Seconds without a sign of life after which a trial of another machine counts as dead."""
 
 _INTERVAL = 30.0  # seconds between two heartbeats
-_CLOCK_DRIFT = 60.0  # seconds by which a system's clock may have been set since a process started
 _DEATHS_ALLOWED = 1  # the options of a trial that died oftener may be what kills the process
 
 
@@ -43,8 +40,7 @@ def kept_alive(trial: optuna.Trial) -> Iterator[None]:
 
     :param trial: that this process runs
     """
-    process = psutil.Process()
-    trial.set_user_attr("owner", {"host": _host(), "pid": process.pid, "started": process.create_time()})
+    trial.set_user_attr("owner", this_process())
     trial.set_user_attr("heartbeat", time.time())
     done = threading.Event()
     thread = threading.Thread(target=_beat, args=(trial, done), name=f"heartbeat-{trial.number}", daemon=True)
@@ -65,10 +61,10 @@ def is_dead(trial: FrozenTrial, now: float | None = None) -> bool:
     :param now: seconds since the epoch; ``None`` asks the clock
     """
     owner = trial.user_attrs.get("owner")
-    if owner is not None and owner["host"] == _host():
-        lives = _lives(owner["pid"], owner["started"])
-        if lives is not None:
-            return not lives
+    if owner is not None and owner["host"] == host():
+        living = lives(owner["pid"], owner["started"])
+        if living is not None:
+            return not living
     started = trial.datetime_start.timestamp() if trial.datetime_start is not None else 0.0
     latest = float(trial.user_attrs.get("heartbeat", started))
     return (time.time() if now is None else now) - latest > HEARTBEAT_LIMIT
@@ -173,22 +169,3 @@ def _beat(trial: optuna.Trial, done: threading.Event) -> None:
             continue  # a database that does not answer for a while; the next beat may reach it
         except UpdateFinishedTrialError:
             return  # another machine took this process for dead
-
-
-def _host() -> str:
-    """Return this machine's name and, on Linux, the namespace its process numbers are valid in."""
-    namespace = Path("/proc/self/ns/pid")
-    return f"{platform.node()} {os.readlink(namespace)}" if namespace.is_symlink() else platform.node()
-
-
-def _lives(pid: int, started: float) -> bool | None:
-    """Return whether a process of this machine lives; ``None`` if one of that number does, but may be another."""
-    try:
-        process = psutil.Process(pid)
-        if process.status() == psutil.STATUS_ZOMBIE:
-            return False
-        return True if abs(process.create_time() - started) < _CLOCK_DRIFT else None
-    except psutil.NoSuchProcess:
-        return False
-    except psutil.AccessDenied:
-        return None

@@ -7,6 +7,7 @@ import gc
 import importlib.metadata
 import json
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -86,11 +87,12 @@ class Objective:
         self.config = scaled(load_preset(preset) if isinstance(preset, str) else preset, load_scale(scale))
         self.space = load_search_space(space)
         self.space.check(self.config)
-        self.n_seeds = check_count("n_seeds", n_seeds)
-        self.n_evaluations = check_count("n_evaluations", n_evaluations, minimum=0)
+        self.n_seeds = check_count("n_seeds (--seeds)", n_seeds)
+        self.n_evaluations = check_count("n_evaluations (--evaluations)", n_evaluations, minimum=0)
         if self.n_evaluations >= self.config.algorithm.total_timesteps:
             raise ConfigError(
-                f"n_evaluations={n_evaluations} does not fit into {self.config.algorithm.total_timesteps} steps."
+                f"n_evaluations (--evaluations)={n_evaluations} must be fewer than the run's "
+                f"{self.config.algorithm.total_timesteps} steps."
             )
         self.output = Path(output)
         self.n_trials = n_trials
@@ -153,7 +155,7 @@ class Objective:
             ("versions", {**run_versions(), "optuna": importlib.metadata.version("optuna")}),
         ):
             trial.set_user_attr(key, attribute)
-        report = _reporting(trial, self.n_seeds, self.n_evaluations)
+        report = _reporting(trial, [seed - self.config.seed for seed in seeds], self.n_evaluations)
         results: list[dict[str, float]] = []
         for seed in seeds:
             result = self._run(dataclasses.replace(config, seed=seed), folder, report)
@@ -253,30 +255,36 @@ class _ByProgress:
 
 
 class _ByInstance:
-    """Reports each task's success after each run; a step is an instance, which is a task and a run.
+    """Reports each task's success after each run; a step is an instance, which is a task and a seed.
 
-    Only finished runs are compared, so resets within them play no part.
+    Only finished runs are compared, so resets within them play no part. Options that are tried again have other seeds,
+    which have no partner in most trials; only those that have one are tested.
+
+    :param trial: to report to
+    :param seeds: of its runs, counted from the study's first
     """
 
-    def __init__(self, trial: optuna.Trial, n_seeds: int) -> None:
-        self.trial, self.n_seeds, self.runs = trial, n_seeds, 0
+    def __init__(self, trial: optuna.Trial, seeds: list[int]) -> None:
+        self.trial, self.left = trial, list(seeds)
 
     def after_evaluation(self, number: int, mean_success: float) -> None:
         """Nothing: values of an instance must be final."""
 
     def after_run(self, success: dict[str, float]) -> None:
+        seed = self.left.pop(0)
         for task, value in enumerate(success.values()):
             if not np.isnan(value):
-                self.trial.report(value, self.runs * len(success) + task)
-        self.runs += 1
-        if self.runs < self.n_seeds and self.trial.should_prune():
-            raise optuna.TrialPruned()
+                self.trial.report(value, seed * len(success) + task)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "WilcoxonPruner finds steps existing in the current trial")
+            if self.left and self.trial.should_prune():
+                raise optuna.TrialPruned()
 
 
-def _reporting(trial: optuna.Trial, n_seeds: int, n_evaluations: int) -> _Reporting:
+def _reporting(trial: optuna.Trial, seeds: list[int], n_evaluations: int) -> _Reporting:
     if isinstance(trial.study.pruner, WilcoxonPruner):
-        return _ByInstance(trial, n_seeds)
-    return _ByProgress(trial, n_seeds, n_evaluations)
+        return _ByInstance(trial, seeds)
+    return _ByProgress(trial, len(seeds), n_evaluations)
 
 
 class _AfterEvaluation(BaseCallback):

@@ -6,6 +6,7 @@ import json
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_ars.errors import ConfigError
+from sb3_ars.experiments.run_folder import write_whole
 from sb3_ars.tuning.liveness import counts, is_dead, why_failed
 from sb3_ars.tuning.study import DEFINITION
 
-__all__ = ["Tried", "TuningSummary", "summarise", "write_results"]
+__all__ = ["Tried", "TuningSummary", "summarise", "unused_seed", "write_results"]
 
 N_RESET = "ars.n_reset"
 
@@ -160,9 +162,23 @@ def trials_table(study: optuna.Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def unused_seed(study: optuna.Study) -> int | None:
+    """Return a seed that no trial has trained, the one after all of theirs; ``None`` if there are none.
+
+    A run with it is the first that did not take part in choosing the best options.
+
+    :param study: with or without trials
+    """
+    used = [seed for trial in study.get_trials(deepcopy=False) for seed in trial.user_attrs.get("seeds", [])]
+    return max(used) + 1 if used else None
+
+
 def _best_config(study: optuna.Study, best: Tried) -> dict[str, Any]:
-    """Return the best options' configuration, with the evaluations of the preset and not those of the study."""
+    """Return the best options' configuration, with the preset's evaluations and a seed that did not choose them."""
     config: dict[str, Any] = study.get_trials()[best.trials[0]].user_attrs["config"]
+    seed = unused_seed(study)
+    if seed is not None:
+        config["seed"] = seed
     definition = study.user_attrs.get(DEFINITION)
     if definition is not None:
         config["evaluation"] = definition["config"]["evaluation"]
@@ -247,9 +263,7 @@ def _draw(study: optuna.Study, summary: TuningSummary, folder: Path) -> tuple[li
             figure = axes.figure
             for suffix in ("png", "svg"):
                 path = folder / f"{name}.{suffix}"
-                unfinished = path.with_suffix(f".unfinished.{suffix}")
-                figure.savefig(unfinished, dpi=130, bbox_inches="tight")
-                unfinished.replace(path)
+                write_whole(path, partial(figure.savefig, dpi=130, bbox_inches="tight"))
                 written.append(path)
             plt.close(figure)
     return written, left_out
@@ -306,7 +320,5 @@ def _mean_or_none(values: list[float | None]) -> float | None:
 
 
 def _write_text(path: Path, text: str) -> Path:
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
+    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
     return path

@@ -11,6 +11,8 @@ from optuna.distributions import BaseDistribution
 from optuna.samplers import BaseSampler, TPESampler
 from optuna.trial import FrozenTrial, TrialState
 
+from sb3_ars.errors import check_count
+
 __all__ = ["NumberedTPESampler"]
 
 
@@ -22,10 +24,11 @@ class NumberedTPESampler(BaseSampler):
 
     :param seed: of the study
     :param n_startup_trials: trials drawn at random before TPE looks at their values
+    :raises ConfigError: if the seed is negative
     """
 
     def __init__(self, seed: int = 0, n_startup_trials: int = 5) -> None:
-        self.seed = seed
+        self.seed = check_count("seed (--sampler-seed)", seed, minimum=0)
         self.n_startup_trials = n_startup_trials
         self._of_trial: BaseSampler = self._make(0)
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import optuna
-import yaml
 from optuna.distributions import (
     BaseDistribution,
     CategoricalDistribution,
@@ -21,7 +20,7 @@ from optuna.distributions import (
 )
 
 from sb3_ars.errors import ConfigError, nearest
-from sb3_ars.experiments.config import RunConfig
+from sb3_ars.experiments.config import RunConfig, read_yaml
 
 __all__ = ["SearchSpace", "TunedOption", "load_search_space", "search_space_names"]
 
@@ -243,11 +242,8 @@ def load_search_space(space: str | Path | Mapping[str, Any] | SearchSpace) -> Se
     if isinstance(space, Mapping):
         return _build(space, "search space", "custom")
     if str(space) in search_space_names():
-        return _build(
-            _parse((_SPACES / f"{space}.yaml").read_text(encoding="utf-8"), str(space)),
-            str(space),
-            str(space),
-        )
+        text = (_SPACES / f"{space}.yaml").read_text(encoding="utf-8")
+        return _build(read_yaml(text, str(space)), str(space), str(space))
     path = Path(space)
     if path.suffix not in (".yaml", ".yml"):
         names = search_space_names()
@@ -255,18 +251,7 @@ def load_search_space(space: str | Path | Mapping[str, Any] | SearchSpace) -> Se
             f"There is no search space {str(space)!r}.{nearest(str(space), names)} There are {', '.join(names)}; "
             "or give the path of your own .yaml file."
         )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"The search space {path} cannot be read: {error.strerror}.") from error
-    return _build(_parse(text, str(path)), str(path), path.stem)
-
-
-def _parse(text: str, where: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where} is not valid YAML: {error}") from error
+    return _build(read_yaml(path, f"The search space {path}"), str(path), path.stem)
 
 
 def _build(values: Any, where: str, name: str) -> SearchSpace:

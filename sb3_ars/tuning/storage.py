@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from sqlalchemy import create_engine
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import NullPool
@@ -34,13 +37,17 @@ def open_storage(storage: str | Path) -> BaseStorage:
         with path.open("ab"):
             pass
         # a lock by opening works on every system; Optuna's default, a symbolic link, needs rights on Windows
-        return JournalStorage(JournalFileBackend(str(path), JournalFileOpenLock(str(path))))
+        lock = JournalFileOpenLock(str(path))
+        _check_journal(path, lock)
+        return JournalStorage(JournalFileBackend(str(path), lock))
     except OSError as error:
         raise ConfigError(
             f"The study's journal {path} cannot be written ({error.strerror}); choose another --storage or --output."
         ) from error
     except (ValueError, KeyError) as error:
-        raise ConfigError(f"{path} is no journal of Optuna's, or a damaged one: {error}") from error
+        raise ConfigError(
+            f"{path} is no journal of Optuna's, or a damaged one ({error}); give another --storage, or mend the file."
+        ) from error
 
 
 def describe_storage(storage: str | Path) -> str:
@@ -49,6 +56,22 @@ def describe_storage(storage: str | Path) -> str:
     :param storage: path or URL
     """
     return _url(str(storage)).render_as_string(hide_password=True) if "://" in str(storage) else str(storage)
+
+
+def _check_journal(path: Path, lock: JournalFileOpenLock) -> None:
+    """Raise ``ValueError`` if a line is none of a journal's; Optuna itself would look past a bad last one at first."""
+    lock.acquire()  # else the last line may be one that another process is writing
+    try:
+        content = path.read_bytes()
+    finally:
+        lock.release()
+    for number, line in enumerate(content.splitlines(keepends=True), start=1):
+        try:
+            whole = line.endswith(b"\n") and isinstance(json.loads(line.decode()), dict)
+        except ValueError:
+            whole = False
+        if not whole:
+            raise ValueError(f"line {number}")
 
 
 def _url(storage: str) -> URL:
@@ -71,21 +94,25 @@ def _database(url: URL) -> BaseStorage:
             stacklevel=4,
         )
     # no pool: a trial asks the storage a few times in hours, and nothing is left open behind it
-    arguments = {} if sqlite else {"connect_args": {"connect_timeout": _CONNECT_TIMEOUT}}
-    for attempt in range(1, _ATTEMPTS + 1):
+    options: dict[str, Any] = {"poolclass": NullPool}
+    if not sqlite:
+        options["connect_args"] = {"connect_timeout": _CONNECT_TIMEOUT}
+    try:
+        create_engine(url, **options).connect().close()  # once: the attempts below are for another fault
+        return _with_tables(url, options)
+    except ImportError as error:
+        raise ConfigError(_missing_driver(url, shown)) from error
+    except (SQLAlchemyError, RuntimeError) as error:  # the latter: tables of another version of Optuna
+        raise _unreachable(url, shown, error) from None  # its text and frames may hold the password
+
+
+def _with_tables(url: URL, options: dict[str, Any]) -> RDBStorage:
+    for attempt in range(1, _ATTEMPTS):
         try:
-            return RDBStorage(
-                url.render_as_string(hide_password=False), engine_kwargs={"poolclass": NullPool, **arguments}
-            )
-        except ImportError as error:
-            raise ConfigError(_missing_driver(url, shown)) from error
-        except DBAPIError as error:
-            if attempt == _ATTEMPTS:
-                raise _unreachable(url, shown, error) from None  # its text and frames may hold the password
+            return RDBStorage(url.render_as_string(hide_password=False), engine_kwargs=options)
+        except DBAPIError:
             time.sleep(0.2 * attempt)
-        except (SQLAlchemyError, RuntimeError) as error:  # the latter: tables of another version of Optuna
-            raise _unreachable(url, shown, error) from None
-    raise AssertionError("the last attempt returns or raises")
+    return RDBStorage(url.render_as_string(hide_password=False), engine_kwargs=options)
 
 
 def _missing_driver(url: URL, shown: str) -> str:

@@ -50,6 +50,7 @@ def tune(
     scale: str = "full",
     seed: int = 0,
     callbacks: Sequence[Callback] = (),
+    before_first_trial: Callable[[optuna.Study], None] | None = None,
 ) -> optuna.Study:
     """Run a study until it has its trials, or go on with one, and return it.
 
@@ -69,12 +70,13 @@ def tune(
     :param scale: size of the runs, such as "toy"
     :param seed: of the sampler
     :param callbacks: called with the study and each trial this process ended
+    :param before_first_trial: called with the study once everything is checked, before anything is trained
     :raises ConfigError: before anything is trained, if an option cannot work, the storage cannot be reached, or the
         study was started with other options
     """
-    n_trials = check_count("n_trials", n_trials)
+    n_trials = check_count("n_trials (--n-trials)", n_trials)
     if timeout is not None and not timeout > 0:
-        raise ConfigError(f"timeout={timeout!r} must be more than 0.")
+        raise ConfigError(f"timeout (--timeout) is {timeout:g} s, but must be more than 0.")
     space = load_search_space(space)
     objective = Objective(
         preset,
@@ -97,19 +99,22 @@ def tune(
         "sampler_seed": seed,
     }
     chosen = make_pruner(pruner, n_seeds, n_evaluations)
+    sampler = NumberedTPESampler(seed)
     folder = Path(output) / name
     where = folder / "journal.log" if storage is None else storage
     ends = math.inf if timeout is None else time.monotonic() + timeout
     with _quiet():
         study = optuna.create_study(
             storage=open_storage(where),
-            sampler=NumberedTPESampler(seed),
+            sampler=sampler,
             pruner=chosen,
             study_name=name,
             direction="maximize",
             load_if_exists=True,
         )
         _agree(study, definition, folder, describe_storage(where))
+        if before_first_trial is not None:
+            before_first_trial(study)
         while True:
             fail_dead_trials(study)
             if time.monotonic() > ends or _are_enough(study, n_trials):
@@ -172,14 +177,14 @@ def make_pruner(name: Pruner, n_seeds: int = 3, n_evaluations: int = 4) -> BaseP
     if name == "median":
         if n_seeds == 1 and n_evaluations == 0:
             raise ConfigError(
-                "The median pruner has nothing to look at: give evaluations, seeds, or pruner none."
+                "The median pruner has nothing to look at: give --evaluations 1, --seeds 2, or --pruner none."
             )
         return MedianPruner(
             n_startup_trials=_STARTUP_TRIALS, n_warmup_steps=math.ceil((n_evaluations + 1) / 2)
         )
     if n_seeds == 1:
         raise ConfigError(
-            "The Wilcoxon pruner looks at finished runs, so with seeds=1 it can never prune; give more."
+            "The Wilcoxon pruner looks at finished runs, so with --seeds 1 it can never prune; give more."
         )
     with warnings.catch_warnings():
         warnings.simplefilter(

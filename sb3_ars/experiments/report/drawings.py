@@ -18,10 +18,11 @@ from sb3_ars.experiments.plots import (
     plot_task_success,
 )
 from sb3_ars.experiments.report.blocks import Block
-from sb3_ars.experiments.report.figures import draw
+from sb3_ars.experiments.report.figures import Drawing, draw
 from sb3_ars.experiments.report.gather import Arm
 from sb3_ars.experiments.report.tables import Column, Row, Table, estr_table, iqm_of
 from sb3_ars.experiments.report.words import (
+    by_tasks,
     numbers_of,
     protocol_text,
     resets_text,
@@ -33,6 +34,7 @@ from sb3_ars.profiling import PARTS
 
 __all__ = [
     "BAND",
+    "FEW_SEEDS",
     "SHOWN",
     "THRESHOLDS",
     "bars_drawing",
@@ -50,6 +52,7 @@ __all__ = [
 THRESHOLDS = (0.1, 0.3, 0.5, 0.7)
 SHOWN = 12  # more methods than this cannot be told apart in one figure
 BAND = "Line: mean over seeds; band: one standard deviation (n - 1) around it"
+FEW_SEEDS = "With fewer than 5 seeds the interval is too narrow: a bootstrap knows no seed that was not run."
 
 
 def success_drawings(name: str, arms: Mapping[str, Arm]) -> list[Block]:
@@ -75,37 +78,39 @@ def curves_drawing(name: str, arms: Mapping[str, Arm], each_seed: bool = False) 
 
 
 def task_curves_drawing(name: str, arms: Mapping[str, Arm]) -> list[Block]:
-    """Return each task's success over training; nothing where no task reports success."""
-    if not arms or not _reports_success(arms):
-        return []
-    source = common_source([run for arm in arms.values() for run in arm.runs])
-    return [
-        draw(
-            f"{name}-task-curves",
-            "Success of each task over training",
+    """Return each task's success over training, a figure for each set of tasks that report success."""
+
+    def drawing(name: str, tasks: str, arms: Mapping[str, Arm]) -> Drawing:
+        source = common_source([run for arm in arms.values() for run in arm.runs])
+        return draw(
+            name,
+            _titled("Success of each task over training", tasks),
             f"{BAND}. {seeds_text(arms.values())} {source_text(source, arms)} {resets_text(arms)}",
             lambda width: plot_task_curves(runs_of(arms), source, width, numbers_of(arms)),
         )
+
+    return [
+        drawing(f"{name}-task-curves{suffix}", tasks, same)
+        for suffix, tasks, same in by_tasks(arms)
+        if _reports_success(same)
     ]
 
 
 def bars_drawing(name: str, arms: Mapping[str, Arm]) -> list[Block]:
-    """Return each task's final success; nothing where no task reports success."""
-    if not arms or not _reports_success(arms):
-        return []
-    n_tasks = len(next(iter(arms.values())).task_names)
-    same = {label: arm for label, arm in arms.items() if len(arm.task_names) == n_tasks}
-    caption = (
-        f"Mean over seeds; small dots: seeds. {seeds_text(same.values())} {protocol_text(same.values())}"
-    )
-    title = "Final success of each task"
-    return [
-        draw(
-            f"{name}-task-bars",
-            title,
-            caption,
-            lambda width: plot_task_success(runs_of(same), width, numbers_of(same)),
+    """Return each task's final success, a figure for each set of tasks that report success."""
+
+    def drawing(name: str, tasks: str, arms: Mapping[str, Arm]) -> Drawing:
+        return draw(
+            name,
+            _titled("Final success of each task", tasks),
+            f"Mean over seeds; small dots: seeds. {seeds_text(arms.values())} {protocol_text(arms.values())}",
+            lambda width: plot_task_success(runs_of(arms), width, numbers_of(arms)),
         )
+
+    return [
+        drawing(f"{name}-task-bars{suffix}", tasks, same)
+        for suffix, tasks, same in by_tasks(arms)
+        if _reports_success(same)
     ]
 
 
@@ -142,7 +147,7 @@ def intervals_drawing(name: str, arms: Mapping[str, Arm]) -> list[Block]:
         return []
     caption = (
         "Point: mean of the middle half of all scores, seeds and tasks pooled. Bar: 95 % interval of a bootstrap that "
-        "resamples seeds within each task; one seed has none. "
+        f"resamples seeds within each task; one seed has none. {FEW_SEEDS} "
         f"{seeds_text(arms.values())} {protocol_text(arms.values())}"
     )
     title = "Interquartile mean of final success, with its uncertainty"
@@ -157,32 +162,42 @@ def intervals_drawing(name: str, arms: Mapping[str, Arm]) -> list[Block]:
 
 
 def scales_drawing(name: str, arms: Mapping[str, Arm]) -> list[Block]:
-    """Return c_i over training, or a sentence where no run scales rewards."""
+    """Return c_i over training, a figure for each set of tasks, or a sentence where no run scales rewards."""
     scaled = {label: arm for label, arm in arms.items() if _is_scaled(arm)}
     others = [label for label in arms if label not in scaled]
     if not scaled:
         return ["No reward scales are shown: c_i stays 1 in all of these runs."] if arms else []
-    caption = (
-        "Line: geometric mean over seeds; band: lowest to highest seed. c_i multiplies the task's reward in the "
-        "critic's target; it is set after the random phase and anew when the networks are reset, or would be. "
-        f"{seeds_text(scaled.values())} "
-        + (f"Not shown, since c_i stays 1: {', '.join(others)}." if others else "")
-    )
-    title = "Reward scale c_i of each task over training"
-    return [draw(f"{name}-scales", title, caption, lambda width: plot_scales(runs_of(scaled), width))]
+
+    def drawing(name: str, tasks: str, arms: Mapping[str, Arm]) -> Drawing:
+        caption = (
+            "Line: geometric mean over seeds; band: lowest to highest seed. c_i multiplies the task's reward in the "
+            "critic's target; it is set after the random phase and anew when the networks are reset, or would be. "
+            f"{seeds_text(arms.values())} "
+            + (f"Not shown, since c_i stays 1: {', '.join(others)}." if others else "")
+        )
+        title = _titled("Reward scale c_i of each task over training", tasks)
+        return draw(name, title, caption, lambda width: plot_scales(runs_of(arms), width))
+
+    return [drawing(f"{name}-scales{suffix}", tasks, same) for suffix, tasks, same in by_tasks(scaled)]
 
 
-def q_drawing(name: str, arms: Mapping[str, Arm], tasks: Sequence[str] | None = None) -> list[Block]:
-    """Return the critics' values over training, of the methods that log them."""
+def q_drawing(name: str, arms: Mapping[str, Arm], shown: Sequence[str] | None = None) -> list[Block]:
+    """Return the critics' values over training, of the methods that log them, a figure for each set of tasks."""
     known = {label: arm for label, arm in arms.items() if _logs(arm, "q_value")}
-    if not known:
-        return []
-    caption = (
-        f"{BAND}. Mean value the critics give to the task's sampled rows, in reward scaled by c_i; each method has an "
-        f"axis of its own. {seeds_text(known.values())}"
-    )
-    title = "Critic values of each task over training"
-    return [draw(f"{name}-q", title, caption, lambda width: plot_q_values(runs_of(known), tasks, width))]
+
+    def drawing(name: str, tasks: str, arms: Mapping[str, Arm]) -> Drawing:
+        caption = (
+            f"{BAND}. Mean value the critics give to the task's sampled rows, in reward scaled by c_i; each method has "
+            f"an axis of its own. {seeds_text(arms.values())}"
+        )
+        title = _titled("Critic values of each task over training", tasks)
+        return draw(name, title, caption, lambda width: plot_q_values(runs_of(arms), shown, width))
+
+    return [
+        drawing(f"{name}-q{suffix}", tasks, same)
+        for suffix, tasks, same in by_tasks(known)
+        if shown is None or set(shown) & set(next(iter(same.values())).task_names)
+    ]
 
 
 def parts_blocks(name: str, arms: Mapping[str, Arm]) -> list[Block]:
@@ -210,6 +225,10 @@ def parts_blocks(name: str, arms: Mapping[str, Arm]) -> list[Block]:
     )
     columns = tuple(map(Column, ("method", *parts, "all")))
     return [drawing, Table(f"{name}-seconds", "Training time by part (seconds)", columns, rows)]
+
+
+def _titled(title: str, tasks: str) -> str:
+    return f"{title} ({tasks})" if tasks else title
 
 
 def _reports_success(arms: Mapping[str, Arm]) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.curves import Curves, common_source, success_curves
 from sb3_ars.experiments.plots import curve_panels, plot_mean_success, short
 from sb3_ars.experiments.report.blocks import Block, Listing, Section
@@ -34,6 +35,7 @@ from sb3_ars.experiments.report.tables import (
     task_table,
 )
 from sb3_ars.experiments.report.words import noted, row_label, runs_of, seeds_text
+from sb3_ars.experiments.scaling import load_scale
 from sb3_ars.experiments.sweeps import Sweep, SweepRow
 
 __all__ = ["sweep_section"]
@@ -52,16 +54,19 @@ def sweep_section(sweep: Sweep, scale: str, found: Gathered) -> Section:
     if "note" in sweep.options:
         blocks.append(str(sweep.options["note"]))
     blocks = [noted(block, arms.values()) if isinstance(block, Table) else block for block in blocks]
-    return Section(name, f"{sweep.source}: {sweep.title} (scale {scale})", tuple(blocks))
+    return Section(name, f"{sweep.source}, “{sweep.title}”: our runs of scale {scale}", tuple(blocks))
 
 
 def _sweep_rows(row: SweepRow, scale: str, found: Gathered) -> list[Row]:
     """Return the table's rows of a method: one for each arm of its preset, an empty one where there is none."""
     arms = [arm for arm in found.arms if (arm.scale, arm.preset) == (scale, row.preset)]
-    n_expected = found.expected.get((scale, row.preset), 0)
+    expected = found.expected.get((scale, row.preset), 0)
     named: list[tuple[str, Arm | None]] = [(arm.named(row.label), arm) for arm in arms]
     named = named or [(row.label, None)]
-    return [Row(label, arm, row.column or "", row.paper, n_expected) for label, arm in named]
+    return [
+        Row(label, arm, row.column or "", row.paper, found.n_expected(arm) if arm else expected)
+        for label, arm in named
+    ]
 
 
 def _sizes_differ(scale: str) -> str:
@@ -73,15 +78,13 @@ def _sizes_differ(scale: str) -> str:
 
 
 def _per_task(name: str, sweep: Sweep, rows: Sequence[Row], arms: Mapping[str, Arm]) -> list[Block]:
-    blocks: list[Block | None] = [
-        task_table(name, f"{sweep.title}: success (%), mean ± std over seeds", rows)
-    ]
+    blocks: list[Block | None] = [task_table(name, "Success of each task (%), mean ± std over seeds", rows)]
     blocks.append(paper_tasks_table(f"{name}-paper", rows))
     return [block for block in [*blocks, *success_drawings(name, arms)] if block is not None]
 
 
 def _bottom_k(name: str, sweep: Sweep, rows: Sequence[Row], arms: Mapping[str, Arm]) -> list[Block]:
-    title = f"{sweep.title}: success (%), mean ± std over seeds"
+    title = "Success of the k worst tasks of each seed (%), mean ± std over seeds"
     return [bottom_k_table(name, title, rows, sweep.options.get("ks", ())), *success_drawings(name, arms)]
 
 
@@ -97,7 +100,8 @@ def _task_sets(name: str, sweep: Sweep, rows: Sequence[Row], arms: Mapping[str, 
     table = task_sets_table(name, f"{sweep.title}: success (%), mean ± std over seeds", rows, n_easy)
     note = (
         f"Easy: each method's {n_easy} best of 10 tasks by their mean over seeds, or the same share of another number; "
-        "difficult: the rest. With that reading the paper's Table 1 gives its Table 4."
+        "difficult: the rest. With that reading the paper's Table 1 gives the row of ARS in its Table 4; of the other "
+        "rows the paper prints no single tasks."
     )
     return [replace(table, notes=(note,)), *success_drawings(name, arms)]
 
@@ -151,19 +155,33 @@ def _bars(name: str, sweep: Sweep, rows: Sequence[Row], arms: Mapping[str, Arm])
 
 
 def _q_values(name: str, sweep: Sweep, rows: Sequence[Row], arms: Mapping[str, Arm]) -> list[Block]:
-    wanted = sweep.options.get("tasks")
+    printed: list[str] = sweep.options.get("tasks", [])
+    wanted = [_stand_ins(rows).get(task, task) for task in printed]
     present = {task for arm in arms.values() for task in arm.task_names}
     blocks: list[Block] = []
     if wanted and not present & set(wanted):
         blocks.append(
-            f"The paper shows {' and '.join(map(short, wanted))}; these runs do not have them, so all tasks are shown."
+            f"The paper shows {' and '.join(map(short, printed))}; these runs do not have them, so all tasks are shown."
         )
-        wanted = None
+        wanted = []
+    elif wanted != printed:
+        pairs = (f"{ours} for {short(task)}" for task, ours in zip(printed, wanted, strict=True))
+        blocks.append(f"At this scale other tasks stand for those the paper shows: {', '.join(pairs)}.")
     return [
         *blocks,
-        *q_drawing(name, arms, wanted),
+        *q_drawing(name, arms, wanted or None),
         mean_table(name, "Final success, mean over tasks (%)", rows),
     ]
+
+
+def _stand_ins(rows: Sequence[Row]) -> Mapping[str, str]:
+    """Return the task that takes the place of each of the paper's at the runs' scale, where the scale is known."""
+    for scale in {row.arm.scale for row in rows if row.arm}:
+        try:
+            return load_scale(scale).stands_for
+        except ConfigError:  # a scale of the user's own, known by its name alone
+            return {}
+    return {}
 
 
 def _estr(name: str, sweep: Sweep, rows: Sequence[Row], arms: Mapping[str, Arm]) -> list[Block]:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.catalogue import preset_names
-from sb3_ars.experiments.config import RunConfig, load_preset
+from sb3_ars.experiments.config import NO_PART_OF_A_METHOD, RunConfig, load_preset
 from sb3_ars.experiments.run_folder import RESULT, Run, find_runs, is_finished, read_run
 from sb3_ars.experiments.scaling import load_scale, scaled
 
@@ -24,8 +24,6 @@ __all__ = ["Arm", "Cell", "Gathered", "differences", "gather"]
 Cell = tuple[str, str, int]
 """What a sweep trains once: scale, preset, seed."""
 
-_NO_PART_OF_A_RUN = ("seed", "output", "scale", "log_interval", "verbose", "profile")
-_NO_PART_OF_A_METHOD = ("evaluation.every",)  # looked at more or less often, the same is learned
 _NAMED = 3  # differing options a label names
 
 
@@ -38,6 +36,7 @@ class Arm:
     :param difference: from other runs of the same scale and preset, in words; empty where there are none
     :param runs: a seed each, in their order
     :param number: its place among those of its scale, which gives it one colour in all figures
+    :param stopped: the step at which its runs ended early, as text; empty where they came to their end
     """
 
     scale: str
@@ -45,6 +44,7 @@ class Arm:
     difference: str
     runs: tuple[Run, ...]
     number: int
+    stopped: str = ""
 
     @property
     def label(self) -> str:
@@ -76,7 +76,7 @@ class Gathered:
 
     :param arms: in the order of the presets
     :param warnings: what was left out, and why
-    :param missing: cells that were expected and not found
+    :param missing: cells that were expected, and of which no run came to its end
     :param expected: number of seeds expected, by scale and preset
     """
 
@@ -89,6 +89,10 @@ class Gathered:
     def runs(self) -> list[Run]:
         """All runs that are used."""
         return [run for arm in self.arms for run in arm.runs]
+
+    def n_expected(self, arm: Arm) -> int:
+        """Return how many seeds of a method were expected, 0 where that is not known or its runs ended early."""
+        return 0 if arm.stopped else self.expected.get((arm.scale, arm.preset), 0)
 
 
 def gather(folders: Sequence[Path], expected: Iterable[Cell] = ()) -> Gathered:
@@ -107,7 +111,7 @@ def gather(folders: Sequence[Path], expected: Iterable[Cell] = ()) -> Gathered:
             + "".join(f"\n  {warning}" for warning in warnings)
         )
     arms = _arms(_newest(runs, warnings))
-    found = {(run.config.scale, run.name, run.seed) for run in runs}
+    found = {(run.config.scale, run.name, run.seed) for run in runs if not _stop(run)}
     cells = list(dict.fromkeys((str(scale), str(preset), int(seed)) for scale, preset, seed in expected))
     counts: defaultdict[tuple[str, str], int] = defaultdict(int)
     for scale, preset, _ in cells:
@@ -126,8 +130,7 @@ def differences(arm: Arm) -> dict[str, tuple[str, str]] | None:
         return None
     before, after = _options(load_preset(arm.preset)), _options(arm.runs[0].config)
     changed = {key: (before[key], after[key]) for key in before if before[key] != after[key]}
-    stop = _stop(arm.runs[0])
-    return changed | ({_STOPPED: ("the end", stop)} if stop else {})
+    return changed | ({_STOPPED: ("the end", arm.stopped)} if arm.stopped else {})
 
 
 _STOPPED = "stopped at step"
@@ -140,7 +143,7 @@ def _read_all(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
             run = read_run(folder)
             run.progress()
             run.evaluations()
-            _check_tasks(run)
+            _check_complete(run)
             runs.append(run)
         except ConfigError as error:
             warnings.append(str(error))
@@ -149,7 +152,12 @@ def _read_all(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
 
 def _unfinished(folders: Sequence[Path]) -> list[str]:
     """Say which runs failed, and which were begun and are neither finished nor failed."""
-    failed = {path.parent.resolve(): path for given in folders for path in given.rglob("error.txt")}
+    failed = {
+        path.parent.resolve(): path
+        for given in folders
+        for path in given.rglob("error.txt")
+        if path.is_file()
+    }
     begun = {path.parent.resolve() for given in folders for path in given.rglob("config.yaml")}
     lines = []
     for folder, path in sorted(failed.items()):
@@ -159,15 +167,12 @@ def _unfinished(folders: Sequence[Path]) -> list[str]:
     return lines + [f"{folder} did not finish." for folder in unfinished]
 
 
-def _check_tasks(run: Run) -> None:
-    needed = {"success", "success_sampled"}
-    for name, values in run.result["tasks"].items():
-        if not isinstance(values, Mapping) or not needed <= values.keys():
-            raise ConfigError(
-                f"{run.folder / RESULT} has no final success of task {name}; train the run again."
-            )
-    if not run.result["tasks"] or "protocol" not in run.result:
-        raise ConfigError(f"{run.folder / RESULT} lacks tasks or protocol; train the run again.")
+def _check_complete(run: Run) -> None:
+    """Refuse what can be read but is too little for a report."""
+    missing = [key for key in ("protocol", "updates", "resets") if key not in run.result]
+    missing += [] if run.task_names else ["tasks"]
+    if missing:
+        raise ConfigError(f"{run.folder / RESULT} lacks {', '.join(missing)}; train the run again.")
 
 
 def _newest(runs: Sequence[Run], warnings: list[str]) -> list[Run]:
@@ -197,7 +202,7 @@ def _arms(runs: Sequence[Run]) -> list[Arm]:
         words = _differences_in_words([_method(same[0]) for same in alike], _reference(scale, preset))
         for word, same in zip(words, alike, strict=True):
             number = sum(arm.scale == scale for arm in arms)
-            arms.append(Arm(scale, preset, word, tuple(same), number))
+            arms.append(Arm(scale, preset, word, tuple(same), number, _stop(same[0])))
     return arms
 
 
@@ -207,8 +212,7 @@ def _identity(run: Run) -> str:
 
 def _method(run: Run) -> dict[str, str]:
     """Return all that tells a run from others of its preset, but for the seed."""
-    options = {key: value for key, value in _options(run.config).items() if key not in _NO_PART_OF_A_METHOD}
-    return options | {_STOPPED: _stop(run)}
+    return {_STOPPED: _stop(run)} | _options(run.config)  # first, so that a label always has room for it
 
 
 def _reference(scale: str, preset: str) -> dict[str, str]:
@@ -226,14 +230,14 @@ def _stop(run: Run) -> str:
 
 
 def _options(config: RunConfig) -> dict[str, str]:
-    """Return every option that could make a difference, as text."""
+    """Return every option that is part of a method, as text."""
     flat: dict[str, str] = {}
     for key, value in dataclasses.asdict(config).items():
         if isinstance(value, dict):
             flat |= {f"{key}.{name}": _shown(item) for name, item in value.items()}
-        elif key not in _NO_PART_OF_A_RUN:
+        else:
             flat[key] = _shown(value)
-    return flat
+    return {key: value for key, value in flat.items() if key not in NO_PART_OF_A_METHOD}
 
 
 def _shown(value: Any) -> str:
@@ -249,8 +253,8 @@ def _shown(value: Any) -> str:
 
 
 def _differences_in_words(alike: Sequence[Mapping[str, str]], reference: Mapping[str, str]) -> list[str]:
-    """Say of each set of options in what it differs from the others and from the preset."""
-    keys = [key for key in alike[0] if len({options[key] for options in alike}) > 1]
+    """Say of each set of options in what it differs from the others and from the preset, and that it ended early."""
+    keys = [key for key in alike[0] if key == _STOPPED or len({options[key] for options in alike}) > 1]
     words: list[str] = []
     for options in alike:
         named = [

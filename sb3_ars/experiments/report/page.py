@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import glob
 import os
+import platform
 import re
 import shutil
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from datetime import datetime
 from importlib import resources
-from itertools import groupby
+from itertools import count, groupby
 from pathlib import Path
 from typing import NamedTuple
 
 import jinja2
+import psutil
 from markupsafe import Markup, escape
 
 from sb3_ars.errors import ConfigError
@@ -30,6 +35,7 @@ PAGE, TABLES = "index.html", "tables"
 """What a report's folder holds: the page, and its tables as CSV and Markdown."""
 
 _GENERATOR = "sb3-ars report"
+_DRAFT = ".draft-"
 
 
 class _Group(NamedTuple):
@@ -63,39 +69,58 @@ def write_report(
     chosen = [load_sweep(name) for name in dict.fromkeys(sweeps)]
     draft = _make_draft(output)
     try:
-        found = gather(folders, expected)
-        made = sections(found, chosen, videos)
-        (draft / TABLES).mkdir()
+        try:
+            found = gather(folders, expected)
+            made = sections(found, chosen, videos)
+        except OSError as error:
+            raise ConfigError(f"The runs cannot be read: {error}") from error
         tables = [block for section in made for block in section.blocks if isinstance(block, Table)]
-        for table in tables:
-            (draft / TABLES / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
-            (draft / TABLES / f"{table.name}.md").write_text(table.to_markdown(), encoding="utf-8")
-        numbers = all_numbers(found)
-        (draft / TABLES / f"{numbers.name}.csv").write_text(numbers.to_csv(), encoding="utf-8")
-        (draft / PAGE).write_text(_html(made, _title(chosen)), encoding="utf-8")
-        (output / PAGE).unlink(missing_ok=True)
-        shutil.rmtree(output / TABLES, ignore_errors=True)
-        (draft / TABLES).replace(output / TABLES)
-        (draft / PAGE).replace(output / PAGE)
+        _write_draft(draft, tables, all_numbers(found), _html(made, _title(chosen)))
+        _swap(draft, output)
     except OSError as error:
         raise ConfigError(
             f"The report cannot be written to {output} ({error.strerror}); choose another --output."
         ) from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-        if output.is_dir() and not any(output.iterdir()):
+        with suppress(OSError):  # not empty, or another report has just done so
             output.rmdir()
     return output / PAGE
 
 
+def _write_draft(draft: Path, tables: Sequence[Table], numbers: Table, page: str) -> None:
+    (draft / TABLES).mkdir()
+    for table in tables:
+        (draft / TABLES / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
+        (draft / TABLES / f"{table.name}.md").write_text(table.to_markdown(), encoding="utf-8")
+    (draft / TABLES / f"{numbers.name}.csv").write_text(numbers.to_csv(), encoding="utf-8")
+    (draft / PAGE).write_text(page, encoding="utf-8")
+
+
+def _swap(draft: Path, output: Path) -> None:
+    """Put a whole draft in the place of the report that is there; of two at a time, the later one stays."""
+    (output / PAGE).unlink(missing_ok=True)
+    for attempt in count():
+        with suppress(FileNotFoundError):
+            (output / TABLES).replace(draft / f"old-{attempt}")
+        try:
+            (draft / TABLES).replace(output / TABLES)
+            break
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # another report's, put there just now
+                raise
+    (draft / PAGE).replace(output / PAGE)
+
+
 def _make_draft(output: Path) -> Path:
     """Return a new folder inside the report's, before any work is done for it."""
-    draft = output / f".draft-{os.getpid()}"
+    draft = output / f"{_DRAFT}{platform.node()}-{os.getpid()}"
     try:
         if output.is_dir() and any(output.iterdir()) and not _is_report(output):
             raise ConfigError(
                 f"{output} holds something else than a report; choose another --output, new or empty."
             )
+        _remove_dead_drafts(output)
         draft.mkdir(parents=True)
     except OSError as error:
         raise ConfigError(
@@ -104,13 +129,21 @@ def _make_draft(output: Path) -> Path:
     return draft
 
 
+def _remove_dead_drafts(output: Path) -> None:
+    """Remove what reports left here that were killed; those of another machine cannot be told from live ones."""
+    for draft in output.glob(f"{_DRAFT}{glob.escape(platform.node())}-*"):
+        pid = draft.name.rpartition("-")[2]
+        if pid.isdigit() and (int(pid) == os.getpid() or not psutil.pid_exists(int(pid))):
+            shutil.rmtree(draft, ignore_errors=True)
+
+
 def _is_report(folder: Path) -> bool:
     """Return whether the folder holds a report, or what an interrupted one left."""
     page = folder / PAGE
     if page.is_file():
         with page.open(encoding="utf-8", errors="replace") as file:
             return f'content="{_GENERATOR}' in file.read(2000)
-    return all(path.name == TABLES or path.name.startswith(".draft-") for path in folder.iterdir())
+    return all(path.name == TABLES or path.name.startswith(_DRAFT) for path in folder.iterdir())
 
 
 def _title(sweeps: Sequence[Sweep]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.report.blocks import Block, Film, Films, Listing, Section
 from sb3_ars.experiments.report.drawings import (
+    FEW_SEEDS,
     SHOWN,
     THRESHOLDS,
     bars_drawing,
@@ -35,12 +36,12 @@ from sb3_ars.experiments.report.tables import (
     task_table,
 )
 from sb3_ars.experiments.report.words import (
+    by_tasks,
     counted,
     environment_differences,
     environment_of,
     labels_of,
     noted,
-    slug,
 )
 from sb3_ars.experiments.scaling import load_scale
 from sb3_ars.experiments.sweeps import Sweep
@@ -70,9 +71,8 @@ def sections(found: Gathered, sweeps: Sequence[Sweep], videos: bool) -> list[Sec
             }
             if here & set(sweep.presets) or len(scales) == 1:
                 made.append(sweep_section(sweep, scale, found))
-        for tasks in dict.fromkeys(arm.task_names for arm in arms):
-            same = [arm for arm in arms if arm.task_names == tasks]
-            made.append(_arms_section(scale, same, labels, found, len({a.task_names for a in arms}) > 1))
+        for suffix, tasks, same in by_tasks({labels[id(arm)]: arm for arm in arms}):
+            made.append(_arms_section(scale, suffix, tasks, same, found))
     if videos:
         made.append(_films_section(found, labels))
     return [*made, _environment_section(found), _runs_section(found), _reading_section()]
@@ -88,7 +88,7 @@ def all_numbers(found: Gathered) -> Table:
             arm.difference,
             str(run.seed),
             task,
-            *(str(values.get(key, "")) for key in columns[5:]),
+            *("" if values.get(key) is None else str(values[key]) for key in columns[5:]),
             run.result["protocol"],
             str(run.folder),
         )
@@ -106,15 +106,27 @@ def all_numbers(found: Gathered) -> Table:
 def _overview(found: Gathered) -> Section:
     scales = list(dict.fromkeys(arm.scale for arm in found.arms))
     seeds = sorted({run.seed for run in found.runs})
+    early = tuple(
+        f"{arm.scale}/{arm.preset}, seed {run.seed}: stopped at step {arm.stopped} of "
+        f"{run.config.algorithm.total_timesteps:,} ({run.folder})"
+        for arm in found.arms
+        if arm.stopped
+        for run in arm.runs
+    )
+    presets = {arm.preset for arm in found.arms}
     blocks: list[Block] = [
-        f"{len(found.runs)} finished runs of {len(found.arms)} methods, seeds {', '.join(map(str, seeds))}; "
+        f"{len(found.runs) - len(early)} finished runs"
+        + (f" and {len(early)} that ended early" if early else "")
+        + f" of {len(presets)} preset{'s' if len(presets) > 1 else ''}, seeds {', '.join(map(str, seeds))}; "
         f"scale{'s' if len(scales) > 1 else ''} {', '.join(scales)}."
     ]
+    if early:
+        title = "Ended before their time, by an interrupt or by what was called after an evaluation"
+        blocks.append(Listing(f"{title}; they stand in rows of their own", early, warning=True))
     if found.missing:
         names = tuple(f"{scale}/{preset}, seed {seed}" for scale, preset, seed in found.missing)
-        blocks.append(
-            Listing(f"Missing: {len(names)} runs that should be here and are not", names, warning=True)
-        )
+        title = f"Missing: {len(names)} runs that should be here, trained to their end, and are not"
+        blocks.append(Listing(title, names, warning=True))
     if found.warnings:
         blocks.append(Listing("Left out of this report", found.warnings, warning=True))
     differ = environment_differences(found.runs)
@@ -134,12 +146,14 @@ def _scale_section(scale: str, arms: Sequence[Arm], labels: Mapping[int, str]) -
     except ConfigError:
         description = ""
     if scale == "full":
-        blocks.append("Runs of the presets as they are. Options that were changed are listed here.")
+        blocks.append(
+            "Runs of the presets as they are. Options of the method that were changed are listed here."
+        )
     else:
         about = f"{description[:1].upper()}{description[1:].rstrip('.')}. " if description else ""
         blocks.append(
-            f"{about}The presets' methods at another size. Listed is every option that differs from the preset, and so "
-            "from the paper's experiment."
+            f"{about}The presets' methods at another size. Listed is every option of the method that differs from the "
+            "preset, and so from the paper's experiment."
         )
     unknown = tuple(labels[id(arm)] for arm in arms if differences(arm) is None)
     if unknown:
@@ -168,23 +182,20 @@ def _difference_rows(arms: Sequence[Arm], labels: Mapping[int, str]) -> tuple[tu
     )
 
 
-def _arms_section(
-    scale: str, arms: Sequence[Arm], labels: Mapping[int, str], found: Gathered, several: bool
-) -> Section:
-    name = f"all-{scale}" + (f"-{slug(arms[0].task_names[0])}-{len(arms[0].task_names)}" if several else "")
-    rows = [
-        Row(labels[id(arm)], arm, n_expected=found.expected.get((arm.scale, arm.preset), 0)) for arm in arms
-    ]
-    labelled = {row.label: row.arm for row in rows if row.arm}
-    shown = dict(list(labelled.items())[:SHOWN])
+def _arms_section(scale: str, suffix: str, tasks: str, arms: Mapping[str, Arm], found: Gathered) -> Section:
+    """Return the section of the methods of a scale that train on the same tasks, by label."""
+    name = f"all-{scale}{suffix}"
+    rows = [Row(label, arm, n_expected=found.n_expected(arm)) for label, arm in arms.items()]
+    n_tasks = len(rows[0].arm.task_names) if rows[0].arm else 0
+    shown = dict(list(arms.items())[:SHOWN])
     tables: list[Block] = [
-        summary_table(f"{name}-summary", "Every method: success, mean ± std over seeds", rows),
-        *intervals_drawing(name, labelled),
+        summary_table(f"{name}-summary", "Every method: success, mean ± std over seeds", rows, FEW_SEEDS),
+        *intervals_drawing(name, arms),
     ]
     blocks: list[Block] = [*tables]
-    if len(shown) < len(labelled):
+    if len(shown) < len(arms):
         blocks.append(
-            f"The figures below show the first {SHOWN} of {len(labelled)} methods; write a report of fewer runs to "
+            f"The figures below show the first {SHOWN} of {len(arms)} methods; write a report of fewer runs to "
             "see the others."
         )
     blocks += [
@@ -199,14 +210,12 @@ def _arms_section(
         estr_numbers(f"{name}-estr", rows, THRESHOLDS),
         *scales_drawing(name, shown),
         *q_drawing(name, shown),
-        *parts_blocks(name, labelled),
+        *parts_blocks(name, arms),
     ]
-    if len(arms[0].task_names) == 1:  # worst tasks, shares of tasks and tasks side by side say nothing of one
+    if n_tasks == 1:  # worst tasks, shares of tasks and tasks side by side say nothing of one
         blocks = [block for block in blocks if not _of_several_tasks(block)]
-    with_notes = [noted(block, arms) if isinstance(block, Table) else block for block in blocks]
-    tasks = f", task {arms[0].task_names[0]}" if len(arms[0].task_names) == 1 else ""
-    title = f"All runs (scale {scale}{tasks or (f', {len(arms[0].task_names)} tasks' if several else '')})"
-    return Section(name, title, tuple(with_notes))
+    with_notes = [noted(block, arms.values()) if isinstance(block, Table) else block for block in blocks]
+    return Section(name, f"All runs (scale {scale}{tasks and f', {tasks}'})", tuple(with_notes))
 
 
 def _of_several_tasks(block: Block) -> bool:
@@ -223,8 +232,8 @@ def _films_section(found: Gathered, labels: Mapping[int, str]) -> Section:
         for run in arm.runs:
             folder = run.folder / "videos"
             for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-                if path.suffix not in _FILM_TYPES:
-                    continue
+                if path.suffix not in _FILM_TYPES or path.name.startswith(".") or not path.is_file():
+                    continue  # a hidden one is still being written
                 if path.stat().st_size > _FILM_BYTES:
                     skipped.append(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
                     continue
@@ -302,7 +311,10 @@ def _reading_section() -> Section:
             "prints; of its figures, 98.8 ± 3.5 over 8 seeds is what seven seeds at 100 and one at 90 give with n - 1 "
             "(with n it would be 3.3). One seed has no ±.",
             "The interquartile mean (IQM) and its interval are those of Agarwal et al. (2021): whole scores are cut, a "
-            "quarter at each end; 2,000 resamples, seeds within each task, percentiles 2.5 and 97.5.",
+            f"quarter at each end; 2,000 resamples, seeds within each task, percentiles 2.5 and 97.5. {FEW_SEEDS}",
+            "The paper's figures need not all come from one protocol: means over 8 seeds of 10 episodes are multiples "
+            "of 1.25, and some of its baselines' figures for single tasks, such as 98 and 62, are not. Those were made "
+            "with another number of seeds or of episodes.",
             "The success of the k worst tasks and the share of tasks solved are computed for each seed, then averaged "
             "over seeds. Every table is in the folder tables/ as CSV and Markdown; tables/all-numbers.csv has every "
             "run's numbers unrounded.",

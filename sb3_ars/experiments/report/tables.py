@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -151,11 +151,11 @@ def iqm_of(arm: Arm) -> Interval | None:
     return iqm_interval(scores) if len(scores) > 1 else Interval(iqm(scores), float("nan"), float("nan"))
 
 
-def summary_table(name: str, title: str, rows: Sequence[Row]) -> Table:
+def summary_table(name: str, title: str, rows: Sequence[Row], *notes: str) -> Table:
     """Return one row per method: seeds, success, IQM, length and duration."""
     columns = ["method", "seeds", "mean success (%)", "with sampled actions (%)", "IQM (%)", "95 % interval"]
     columns += ["env steps", "resets", "training time (min)"]
-    return Table(name, title, _columns(columns), tuple(_summary_row(row) for row in rows))
+    return Table(name, title, _columns(columns), tuple(_summary_row(row) for row in rows), notes)
 
 
 def task_table(name: str, title: str, rows: Sequence[Row]) -> Table:
@@ -199,15 +199,22 @@ def paper_tasks_table(name: str, rows: Sequence[Row]) -> Table | None:
 def bottom_k_table(name: str, title: str, rows: Sequence[Row], ks: Sequence[int] = ()) -> Table:
     """Return mean success of the k worst tasks of each seed.
 
-    :param ks: the paper's; where there are fewer tasks, the same shares of them
+    :param ks: the paper's; where there are fewer tasks, about the same shares of them, each once
     """
     n_tasks = max((len(row.arm.task_names) for row in rows if row.arm), default=max(ks, default=1))
     shares = [k / max(ks) for k in ks] or [0.2, 0.4, 0.6, 0.8, 1.0]
-    fitting = list(dict.fromkeys(max(1, round(share * n_tasks)) for share in shares))
+    each = [max(1, round(share * n_tasks)) for share in shares]
+    fitting = list(dict.fromkeys(each))
     lines = [(row.label, row.seeds, *(_per_seed(row, _worst, k) for k in fitting)) for row in rows]
     headings = ["method", "seeds", *(f"k = {k}" for k in fitting)]
     flat = [_flat(row, "bottom_k") for row in rows]
-    return _with_paper(name, title, headings, lines, flat, {str(k): f"k = {k}" for k in ks})
+    table = _with_paper(name, title, headings, lines, flat, {str(k): f"k = {k}" for k in ks})
+    if not ks or n_tasks == max(ks):
+        return table
+    pairs = ", ".join(f"{k} → {own}" for k, own in zip(ks, each, strict=True))
+    return replace(
+        table, notes=(f"The paper's k of {max(ks)} tasks, and ours of {n_tasks}, rounded: {pairs}.",)
+    )
 
 
 def estr_table(name: str, title: str, rows: Sequence[Row], thresholds: Sequence[float]) -> Table:

@@ -12,6 +12,7 @@ from sb3_ars.experiments.run_folder import Run
 from sb3_ars.experiments.sweeps import Sweep
 
 __all__ = [
+    "by_tasks",
     "counted",
     "environment_differences",
     "environment_of",
@@ -23,7 +24,6 @@ __all__ = [
     "row_label",
     "runs_of",
     "seeds_text",
-    "slug",
     "source_text",
 ]
 
@@ -47,6 +47,27 @@ def labels_of(found: Gathered, sweeps: Sequence[Sweep]) -> dict[int, str]:
 def row_label(row: Row) -> str:
     """Return the name of a table's row that stands alone."""
     return f"{row.column}, {row.label}" if row.column else row.label
+
+
+def by_tasks(arms: Mapping[str, Arm]) -> list[tuple[str, str, dict[str, Arm]]]:
+    """Part methods by the tasks they train on, since tasks are drawn side by side.
+
+    :param arms: by label
+    :return: suffix for names, the tasks in words, and the methods of each part; the suffix is empty where all train on
+        the same tasks, and so are the words where these are several
+    """
+    parts: dict[tuple[str, ...], dict[str, Arm]] = {}
+    for label, arm in arms.items():
+        parts.setdefault(arm.task_names, {})[label] = arm
+    several = len(parts) > 1
+    return [
+        (f"-{number}" if several else "", _tasks_text(tasks) if several or len(tasks) == 1 else "", same)
+        for number, (tasks, same) in enumerate(parts.items(), start=1)
+    ]
+
+
+def _tasks_text(tasks: Sequence[str]) -> str:
+    return f"task {tasks[0]}" if len(tasks) == 1 else f"{len(tasks)} tasks, {tasks[0]} to {tasks[-1]}"
 
 
 def runs_of(arms: Mapping[str, Arm]) -> dict[str, Sequence[Run]]:
@@ -131,8 +152,3 @@ def counted(counts: Mapping[str, int]) -> str:
 
 def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
-
-
-def slug(text: str) -> str:
-    """Return a text with everything but letters and digits replaced, for an anchor."""
-    return "".join(letter if letter.isalnum() else "-" for letter in text.lower())
