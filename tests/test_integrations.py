@@ -16,8 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ars import ARSSAC, ARSTQC, make_toy_env
 from sb3_ars.errors import ConfigError
-from sb3_ars.experiments.config import load_preset, with_options
-from sb3_ars.experiments.runner import train
+from sb3_ars.experiments.config import load_preset
 from sb3_ars.integrations.gymnasium_env import TaskSet
 
 ROOT = Path(__file__).parents[1]
@@ -51,20 +50,6 @@ def python(script, folder, **environment):
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     return done.stdout
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A finished toy run, of few steps."""
-    options = {
-        "algorithm": {"total_timesteps": 400},
-        "ars": {"param_resets": [300], "updates_after_reset": 2},
-        "policy": {"net_arch": [8]},
-        "evaluation": {"n_episodes": 1},
-    }
-    folder = tmp_path_factory.mktemp("runs") / "toy"
-    train(with_options(load_preset("toy"), options, "test"), "toy", progress_bar=False, folder=folder)
-    return folder
 
 
 # ---------------------------------------------------------------- ONNX

@@ -14,8 +14,6 @@ from sb3_ars.envs import rendering
 from sb3_ars.envs.toy import PointTask
 from sb3_ars.errors import ConfigError
 from sb3_ars.evaluation import EvaluationProtocol, evaluate_tasks, make_evaluation_env
-from sb3_ars.experiments.config import load_preset, with_options
-from sb3_ars.experiments.runner import train
 from sb3_ars.video import record, record_episodes, write_video
 
 TINY = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 3, "device": "cpu"}
@@ -34,20 +32,6 @@ def gl():
 @pytest.fixture(scope="module")
 def toy_model():
     return ARSSAC("MlpPolicy", make_toy_env(seed=0), **TINY)
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A finished toy run, of few steps."""
-    options = {
-        "algorithm": {"total_timesteps": 400},
-        "ars": {"param_resets": [300], "updates_after_reset": 2},
-        "policy": {"net_arch": [8]},
-        "evaluation": {"n_episodes": 1},
-    }
-    folder = tmp_path_factory.mktemp("runs") / "toy"
-    train(with_options(load_preset("toy"), options, "test"), "toy", progress_bar=False, folder=folder)
-    return folder
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
