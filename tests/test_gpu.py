@@ -92,7 +92,7 @@ METHODS = {
     "multi_head": ({"body": {"name": "multi_head"}}, {}),
     "soft_modules": ({"body": {"name": "soft_modules"}}, {"task_weighting": "temperature"}),
     "moore": ({"body": {"name": "moore"}}, {}),
-    "paco": ({"body": {"name": "paco"}}, {"max_task_loss": 0.3}),
+    "paco": ({"body": {"name": "paco"}}, {"max_task_loss": 0.85}),
     "popart": ({"critic_body": {"name": "popart", "update_period": 3}}, {"reward_scaling": "none"}),
     "lora": (
         {},

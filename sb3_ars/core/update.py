@@ -355,7 +355,9 @@ def _step(
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     gradients = combiner.combine(losses, parameters, order)
     for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
+        # Autograd may give a transposed view. Fused Adam reads it as if it were not one on the CPU (torch 2.13), and
+        # refuses it on CUDA.
+        parameter.grad = None if gradient is None else gradient.contiguous()
     optimizer.step()
 
 
