@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from sb3_ars.algorithms.tqc import ARSTQC
     from sb3_ars.buffers import TaskReplayBuffer
     from sb3_ars.callbacks.ars import ARSCallback
+    from sb3_ars.callbacks.checkpoint import RunCheckpoint
     from sb3_ars.callbacks.evaluation import TaskEvalCallback
     from sb3_ars.callbacks.schedule import TaskScheduleCallback
     from sb3_ars.config import ARSConfig
     from sb3_ars.core.schedule import SMTConfig
     from sb3_ars.envs import make_metaworld_env, make_multitask_env, make_toy_env
-    from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, WorkerError
+    from sb3_ars.errors import CheckpointError, ConfigError, DivergedError, EnvContractError, WorkerError
     from sb3_ars.evaluation import evaluate_tasks
 
 __version__ = "0.1.0"
@@ -28,6 +29,7 @@ _MODULE_OF = {
     "ARSTQC": "algorithms.tqc",
     "TaskReplayBuffer": "buffers",
     "ARSCallback": "callbacks.ars",
+    "RunCheckpoint": "callbacks.checkpoint",
     "TaskEvalCallback": "callbacks.evaluation",
     "TaskScheduleCallback": "callbacks.schedule",
     "ARSConfig": "config",
@@ -35,6 +37,7 @@ _MODULE_OF = {
     "make_metaworld_env": "envs",
     "make_multitask_env": "envs",
     "make_toy_env": "envs",
+    "CheckpointError": "errors",
     "ConfigError": "errors",
     "DivergedError": "errors",
     "EnvContractError": "errors",
@@ -47,9 +50,11 @@ __all__ = [
     "ARSTQC",
     "ARSCallback",
     "ARSConfig",
+    "CheckpointError",
     "ConfigError",
     "DivergedError",
     "EnvContractError",
+    "RunCheckpoint",
     "SMTConfig",
     "TaskEvalCallback",
     "TaskReplayBuffer",

@@ -6,7 +6,8 @@ import base64
 import dataclasses
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+import secrets
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,18 @@ __all__ = ["TaskReplayBuffer"]
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones")
 _REBUILT = (  # attributes made anew from the rest when a pickle is loaded
     *_COLUMNS,
-    *("task_pos", "task_size", "_layout", "_row_width", "_generator", "_sizes", "_first_slots", "_one_hots"),
+    *(
+        "task_pos",
+        "task_size",
+        "task_total",
+        "history",
+        "_layout",
+        "_row_width",
+        "_generator",
+        "_sizes",
+        "_first_slots",
+        "_one_hots",
+    ),
     *("_storage", "_frames", "_flat", "_pointers", "_flat_observations", "_staging"),
 )
 _MAGIC = b"\xa5sb3_ars task buffer 1\n"  # its first byte is no pickle's
@@ -143,6 +155,7 @@ class TaskReplayBuffer(ReplayBuffer):
         host["slots"][:] = slots + self._task_of_row * self.buffer_size
         self.task_pos[:] = (self.task_pos + self._rows_of_task) % self.buffer_size
         self.task_size[:] = np.minimum(self.task_size + self._rows_of_task, self.buffer_size)
+        self.task_total += self._rows_of_task
         self._count_as_sb3()
         host["sizes"][:, 0] = self.task_size
         has_previous = self._frames is not None and self._link_frames(self._frames, host)
@@ -159,6 +172,7 @@ class TaskReplayBuffer(ReplayBuffer):
         super().reset()
         self.task_pos[:] = 0
         self.task_size[:] = 0
+        self._begin_history(self.task_size)
         self._write_sizes(th.from_numpy(self.task_size).unsqueeze(1))
         if self._frames is not None:
             self._frames.clear()
@@ -216,7 +230,8 @@ class TaskReplayBuffer(ReplayBuffer):
         rows = self._flat.index_select(0, (slots + self._first_slots).reshape(-1))
         column = {name: rows[:, where] for name, where in self._layout.items()}
         if self._frames is not None:
-            column["next_observations"] = self._next_frames(self._frames, slots, rows.view(th.int32)[:, -1])
+            pointers = rows.view(th.int32)[:, -1]
+            column["next_observations"] = self._next_frames(self._frames, slots, self._first_slots, pointers)
         one_hot = self._one_hot(slots.shape[1])
 
         def observations(name: str) -> th.Tensor:
@@ -381,6 +396,151 @@ class TaskReplayBuffer(ReplayBuffer):
             self.reset()
             raise
 
+    # ------------------------------------------------------------------ checkpoints
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps beside the rows, as plain values and tensors."""
+        return {
+            "history": self.history,
+            "task_total": self.task_total.tolist(),
+            "buffer_size": int(self.buffer_size),
+            "seed": self.seed,
+            "generator_device": self._device.type,
+            "generator_state": self._generator.get_state(),
+        }
+
+    def oldest(self) -> list[int]:
+        """Return the number of each task's oldest stored transition, counted over all it ever had."""
+        ages: list[int] = (self.task_total - self.task_size).tolist()
+        return ages
+
+    def write_rows(self, file: Any, first: Sequence[int]) -> None:
+        """Write the newest transitions of every task, from the ``first``-th it ever had on; task by task.
+
+        The form is the same whatever the layout in memory: float32, ``(obs, next_obs, action, reward, done)``.
+
+        :param file: open for writing bytes
+        :param first: one number per task, at least those of :meth:`oldest`
+        """
+        for task, (start, stop) in enumerate(zip(first, self.task_total.tolist(), strict=True)):
+            for slots in self._runs_of_slots(start, stop):
+                file.write(self._plain_rows(task, slots).cpu().numpy().data.cast("B"))
+
+    def restore_checkpoint_state(
+        self, state: Mapping[str, Any], parts: Iterable[tuple[Any, Sequence[int], Sequence[int]]]
+    ) -> None:
+        """Replace what is stored by what a checkpoint kept: the same transitions in the same slots.
+
+        :param state: of :meth:`checkpoint_state`
+        :param parts: files of :meth:`write_rows`, oldest first, open for reading bytes, each with the number of every
+            task's first transition in it and the one behind its last
+        :raises ConfigError: if a file ends too early, or the parts leave a gap; this buffer is then empty
+        """
+        check_count("buffer_size", state["buffer_size"])
+        self._check_numbers(state["task_total"])
+        self.reset()
+        if state["buffer_size"] != self.buffer_size:
+            self._release_storage()
+            self.buffer_size = state["buffer_size"]
+            self._place_counters()
+        total = np.asarray(state["task_total"], dtype=np.int64)
+        self.task_size[:], self.task_pos[:] = np.minimum(total, self.buffer_size), total % self.buffer_size
+        self.task_total, self.history = total, state["history"]
+        if total.any():
+            self._allocate()
+        try:
+            self._read_parts(parts)
+        except BaseException:
+            self.reset()
+            raise
+        self._count_as_sb3()
+        self._write_sizes(th.from_numpy(self.task_size).unsqueeze(1))
+        self.seed = state["seed"]
+        self._generator.manual_seed(self.seed)
+        if state["generator_device"] == self._device.type:
+            self._generator.set_state(state["generator_state"])
+
+    def _read_parts(self, parts: Iterable[tuple[Any, Sequence[int], Sequence[int]]]) -> None:
+        expected = np.asarray(self.oldest())
+        width = 4 * self._plain_width
+        linkers = [
+            _Linker(self._frames, task, self.buffer_size, int(n_envs))
+            for task, n_envs in enumerate(np.bincount(self.task_of_env, minlength=self.n_tasks))
+            if self._frames is not None
+        ]
+        for file, first, stop in parts:
+            for numbers in (first, stop):
+                self._check_numbers(numbers)
+            source = getattr(file, "name", "the given file")
+            for task, (start, end) in enumerate(zip(first, stop, strict=True)):
+                wanted = min(max(start, int(expected[task])), end)
+                file.seek((wanted - start) * width, io.SEEK_CUR)
+                if wanted > expected[task] and wanted < end:
+                    raise ConfigError(
+                        f"{source} leaves a gap: rows of task {self.task_names[task]!r} are missing."
+                    )
+                for slots in self._runs_of_slots(wanted, end):
+                    rows = np.empty((slots.stop - slots.start, self._plain_width), np.float32)
+                    _read_exactly(file, rows.data.cast("B"), source)
+                    self._put_rows(task, slots, th.from_numpy(rows), linkers)
+                expected[task] = max(expected[task], end)
+        for linker in linkers:
+            linker.finish(self._pointers)
+        missing = [self.task_names[task] for task in np.flatnonzero(expected != self.task_total)]
+        if missing:
+            raise ConfigError(f"The checkpoint lacks the newest transitions of {', '.join(missing)}.")
+
+    def _check_numbers(self, numbers: Sequence[int]) -> None:
+        if len(numbers) != self.n_tasks:
+            raise ConfigError(
+                f"The checkpoint counts transitions of {len(numbers)} tasks, not of {self.n_tasks}."
+            )
+        for number in numbers:
+            check_count("number of a transition", number, minimum=0)
+
+    def _put_rows(self, task: int, slots: slice, rows: th.Tensor, linkers: Sequence[_Linker]) -> None:
+        """Store transitions in the plain form in consecutive slots."""
+        assert self._storage is not None
+        if not linkers:
+            self._storage[task, slots].copy_(rows)
+            return
+        obs, next_obs, rest = th.split(rows, [self.obs_dim, self.obs_dim, self.action_dim + 2], dim=1)
+        self._storage[task, slots, :-1] = th.cat((obs, rest), dim=1).to(self._device)
+        linkers[task].link(self._pointers, slots, obs.numpy(), next_obs.numpy())
+        self.storage_version += 1  # the table of frames may have grown
+
+    def _plain_rows(self, task: int, slots: slice) -> th.Tensor:
+        """Return the transitions in consecutive slots in the plain form, ``(n, width)`` float32, contiguous."""
+        assert self._storage is not None
+        rows = self._storage[task, slots]
+        if self._frames is None:
+            return rows
+        numbers = th.arange(slots.start, slots.stop, device=self._device)
+        first_slots = self._first_slots[task]
+        next_obs = self._next_frames(self._frames, numbers, first_slots, rows.view(th.int32)[:, -1])
+        return th.cat((rows[:, : self.obs_dim], next_obs, rows[:, self.obs_dim : -1]), dim=1)
+
+    @property
+    def _plain_width(self) -> int:
+        return 2 * self.obs_dim + self.action_dim + 2
+
+    def _runs_of_slots(self, start: int, stop: int) -> Iterator[slice]:
+        """Yield where the transitions from one number to another lie, in runs that are not too long for a copy."""
+        longest = max(1, _CHUNK_BYTES // (4 * self._plain_width))
+        while start < stop:
+            slot = start % self.buffer_size
+            n = min(stop - start, self.buffer_size - slot, longest)
+            yield slice(slot, slot + n)
+            start += n
+
+    def _begin_history(self, task_size: np.ndarray) -> None:
+        """Count transitions anew: what is stored is not what an earlier checkpoint has rows of."""
+        # as if nothing had been stored before the oldest but what brings ``task_pos`` where it is
+        self.task_total = np.where(task_size < self.buffer_size, task_size, self.buffer_size + self.task_pos)
+        self.history = secrets.token_hex(6)
+
+    # ------------------------------------------------------------------ pickles
+
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but unwritten slots; tensors as NumPy arrays, which pickle without a second copy."""
         header = self._header()
@@ -473,6 +633,7 @@ class TaskReplayBuffer(ReplayBuffer):
             self._place_counters()
         self.handle_timeout_termination = header.handle_timeout_termination
         self.task_size[:], self.task_pos[:] = header.task_size, header.task_pos
+        self._begin_history(self.task_size)
         self._count_as_sb3()
         self._write_sizes(th.from_numpy(self.task_size).unsqueeze(1))
         self.seed = header.seed
@@ -501,6 +662,7 @@ class TaskReplayBuffer(ReplayBuffer):
     def _start_empty(self) -> None:
         self.task_pos = np.zeros(self.n_tasks, dtype=np.int64)
         self.task_size = np.zeros(self.n_tasks, dtype=np.int64)
+        self._begin_history(self.task_size)
         self._layout, self._row_width = self._lay_out()
         self._generator = self._make_generator()
         self._place_counters()
@@ -575,10 +737,12 @@ class TaskReplayBuffer(ReplayBuffer):
         self.storage_version += has_grown
         return has_previous
 
-    def _next_frames(self, frames: _FrameTable, slots: th.Tensor, pointers: th.Tensor) -> th.Tensor:
-        """Return next observations, ``(n_tasks * batch, obs_dim)``: rows of the table, or later slots' observations."""
+    def _next_frames(
+        self, frames: _FrameTable, slots: th.Tensor, first_slots: th.Tensor, pointers: th.Tensor
+    ) -> th.Tensor:
+        """Return next observations, one per pointer: rows of the table, or later slots' observations."""
         ahead = pointers.clamp(max=0).view_as(slots)
-        later = ((slots - ahead) % self.buffer_size + self._first_slots).reshape(-1)
+        later = ((slots - ahead) % self.buffer_size + first_slots).reshape(-1)
         return th.where(
             (pointers >= 0).unsqueeze(1),
             frames.table.index_select(0, pointers.clamp(min=0)),
@@ -793,6 +957,20 @@ class _FrameTable:
         self._free = [row for row in self._free if row not in taken]
         return len(taken) == len(self._row_of_slot)
 
+    def keep(self, slots: Sequence[int], frames: np.ndarray) -> np.ndarray:
+        """Give transitions rows of their own, and return which.
+
+        :param slots: of the transitions, over all rings
+        :param frames: their next observations, ``(n, obs_dim)``
+        """
+        self.reserve(len(self.table) - len(self._free) + len(slots))
+        rows = [self._free.pop() for _ in slots]
+        self._row_of_slot |= zip(slots, rows, strict=True)
+        self.table[th.tensor(rows, dtype=th.int64, device=self.table.device)] = th.from_numpy(frames).to(
+            self.table.device
+        )
+        return np.array(rows, dtype=np.int32)
+
     def to(self, device: th.device) -> _FrameTable:
         """Move the table and return it.
 
@@ -806,6 +984,64 @@ class _FrameTable:
         assert self._slot_of_env is not None
         slots, rows = self._slot_of_env[envs].tolist(), self._row_of_env[envs].tolist()
         self._row_of_slot |= zip(slots, rows, strict=True)
+
+
+class _Linker:
+    """Points the transitions of one ring, read one run after another, at their next observations.
+
+    :param frames: the table
+    :param task: whose ring it is
+    :param buffer_size: slots of a ring
+    :param n_envs: of the task: the next transition of the same env is so many later
+    """
+
+    def __init__(self, frames: _FrameTable, task: int, buffer_size: int, n_envs: int) -> None:
+        self._frames, self._first_slot, self._buffer_size = frames, task * buffer_size, buffer_size
+        self._ahead = n_envs
+        self._slots = np.empty(0, dtype=np.int64)  # of transitions whose next one is not here yet
+        self._next_obs = np.empty((0, 0), dtype=np.float32)
+
+    def link(self, pointers: th.Tensor, slots: slice, obs: np.ndarray, next_obs: np.ndarray) -> None:
+        """Take in transitions that follow those before.
+
+        :param pointers: of all rings, ``(n_tasks * buffer_size,)`` int32, written
+        :param slots: in the ring
+        :param obs: ``(n, obs_dim)``
+        :param next_obs: the same
+        """
+        if len(self._slots):
+            next_obs = np.concatenate((self._next_obs, next_obs))
+        here = np.concatenate((self._slots, np.arange(slots.start, slots.stop))).astype(np.int64)
+        n_before = len(self._slots)
+        n_known = max(0, len(here) - self._ahead)  # those whose next transition is among ``obs``
+        later = np.arange(n_known) + self._ahead - n_before
+        follows = np.zeros(n_known, dtype=bool)
+        inside = later >= 0
+        seen = obs[later[inside]].view(np.int32)
+        follows[inside] = (next_obs[:n_known][inside].view(np.int32) == seen).all(axis=1)
+        self._point(pointers, here[:n_known][follows], np.int32(-self._ahead))
+        self._keep(pointers, here[:n_known][~follows], next_obs[:n_known][~follows])
+        self._slots, self._next_obs = here[n_known:], next_obs[n_known:]
+
+    def finish(self, pointers: th.Tensor) -> None:
+        """Let the newest transitions keep their next observations.
+
+        :param pointers: see :meth:`link`
+        """
+        self._keep(pointers, self._slots, self._next_obs)
+
+    def _keep(self, pointers: th.Tensor, slots: np.ndarray, frames: np.ndarray) -> None:
+        if len(slots):
+            self._point(
+                pointers,
+                slots,
+                self._frames.keep((slots + self._first_slot).tolist(), np.ascontiguousarray(frames)),
+            )
+
+    def _point(self, pointers: th.Tensor, slots: np.ndarray, where: Any) -> None:
+        values = np.broadcast_to(np.asarray(where, dtype=np.int32), slots.shape).copy()
+        index = th.from_numpy(slots + self._first_slot).to(pointers.device)
+        pointers[index] = th.from_numpy(values).to(pointers.device)
 
 
 @dataclasses.dataclass(frozen=True)

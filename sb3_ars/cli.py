@@ -27,6 +27,7 @@ _USAGE = """sb3-ars: multi-task reinforcement learning with adaptive reward scal
 
   sb3-ars list [WORD ...]            show the presets, or those with every word in their names
   sb3-ars train PRESET [OPTIONS]     train and evaluate
+  sb3-ars train --resume RUN         go on with a run that was interrupted
   sb3-ars evaluate RUN [OPTIONS]     evaluate a run's policy again
   sb3-ars bench TABLE ... [OPTIONS]  train the cells of the paper's tables and figures, and report them
   sb3-ars tune PRESET [OPTIONS]      search for n_reset, or any other option, with Optuna

@@ -11,11 +11,23 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["ConfigError", "DivergedError", "EnvContractError", "WorkerError", "check_count", "nearest"]
+__all__ = [
+    "CheckpointError",
+    "ConfigError",
+    "DivergedError",
+    "EnvContractError",
+    "WorkerError",
+    "check_count",
+    "nearest",
+]
 
 
 class ConfigError(ValueError):
     """An option, or a combination of options, that cannot work; raised before time is spent."""
+
+
+class CheckpointError(ConfigError):
+    """A checkpoint that is missing, damaged, or does not fit the model or the environment."""
 
 
 class DivergedError(RuntimeError):

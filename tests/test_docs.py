@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import zlib
@@ -16,7 +17,7 @@ import pytest
 import yaml
 
 import sb3_ars
-from sb3_ars import cli
+from sb3_ars import RunCheckpoint, cli
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.envs.rendering import find_gl_backend
 from sb3_ars.envs.toy import PointTask, make_toy_env
@@ -82,6 +83,20 @@ def train_runs_that_are_named(text):
             assert cli.main(shlex.split(how(f"sb3-ars train {preset} --seed {seed}")[1])[1:]) == 0
 
 
+def leave_interrupted(folder):
+    """Put a run that Ctrl-C has ended early where an example resumes one."""
+    preset, seed = re.fullmatch(r"runs/([\w-]+?)-seed(\d+)", folder).groups()
+    shutil.rmtree(folder, ignore_errors=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunCheckpoint, "_on_step", lambda self: self.num_timesteps < 100 or _interrupt())
+        assert cli.main(shlex.split(how(f"sb3-ars train {preset} --seed {seed}")[1])[1:]) == 0
+
+
+def _interrupt():
+    signal.raise_signal(signal.SIGINT)
+    return True
+
+
 def version(package):
     """The installed version of a package, empty where there is none."""
     try:
@@ -134,6 +149,7 @@ ZOO = "--seed 1 -params batch_size:8 updates_after_reset:2"
 
 HOW = [  # (the start of a command as a regular expression, what to append so that it takes a moment); the first counts
     (r"sb3-ars (list|doctor)", ""),
+    (r"sb3-ars train --resume", ""),
     (r"sb3-ars train toy", f"{RUN} --ars.param-resets 100"),
     (r"sb3-ars train demo", f"{RUN} {REAL} --ars.param-resets 100"),
     (r"sb3-ars train mt\d+-smt", f"{RUN} {REAL} --schedule.pool-size 1 --schedule.interval 40"),
@@ -251,6 +267,8 @@ def test_the_commands_of_a_page_run_one_after_another(page, folder, monkeypatch,
         if reason is not None:
             left_out.append(f"{command}: {reason}")
             continue
+        if "--resume" in command:
+            leave_interrupted(command.split()[-1])
         train_runs_that_are_named(command)
         capfd.readouterr()
         status = run(command, monkeypatch)

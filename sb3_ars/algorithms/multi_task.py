@@ -12,7 +12,7 @@ import pickle
 import warnings
 import zipfile
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -36,7 +36,9 @@ from stable_baselines3.common.type_aliases import (
 )
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_ars.algorithms.checkpoint import RowsOnDisk, model_of_checkpoint
 from sb3_ars.algorithms.execution import CapturedActor, ExecutionPlan, WorkWhileStepping, plan_execution
+from sb3_ars.algorithms.run_state import restore_pending
 from sb3_ars.algorithms.task_log import TaskLog
 from sb3_ars.buffers import TaskReplayBuffer
 from sb3_ars.callbacks.ars import ARSCallback
@@ -252,6 +254,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.task_episodes: list[deque[dict[str, float]]] = []  # the latest of each task; TaskLog's
         self.active_tasks: list[int] | None = None  # None is all
         self.schedule_state: dict[str, Any] | None = None  # TaskScheduleCallback's
+        self.last_checkpoint: pathlib.Path | None = None
+        """The newest checkpoint that this process wrote or was resumed from."""
+        self.rows_on_disk: RowsOnDisk | None = None  # where checkpoints go on from
+        self._to_restore: dict[str, Any] | None = None  # what learn() makes anew when it begins
+        self._after_learn: list[Callable[[], object]] = []
         self._stepping_env: WorkWhileStepping | None = None
         self._is_stepping = False  # from a rollout's first action to its end
         self.scaled_by: str | None = None  # the reward_scaling that c_i comes from
@@ -622,10 +629,29 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
                 reset_num_timesteps=reset_num_timesteps,
                 progress_bar=progress_bar,
             )
+        except DivergedError as error:
+            if self.last_checkpoint is None:
+                raise
+            raise DivergedError(f"{error} The last good checkpoint is {self.last_checkpoint}.") from error
         finally:
             self._updates_are_done = False  # a train() of the user's own is not learn()'s
             self._leave_schedule()
+            while self._after_learn:
+                self._after_learn.pop()()
         return self
+
+    def after_learn(self, function: Callable[..., object], *arguments: Any) -> None:
+        """Have a function called once when the running ``learn()`` ends, however it ends; the last one first.
+
+        :param function: what to call
+        :param arguments: its arguments
+        """
+        self._after_learn.append(partial(function, *arguments))
+
+    @property
+    def remaining_timesteps(self) -> int:
+        """Environment steps that the run whose checkpoint this is had left: what to call ``learn`` with."""
+        return max(0, self._total_timesteps - self.num_timesteps)
 
     def _leave_schedule(self) -> None:
         """Let all tasks collect where a schedule chose some: it goes on from its own state."""
@@ -651,7 +677,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._leave_schedule()
         if self.active_tasks is not None:  # a loaded model's environment and buffer know nothing of it
             self.set_active_tasks(self.active_tasks)
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        restore_pending(self, callback)
+        return total_timesteps, callback
 
     def _resolve_learning_starts(self, total_timesteps: int, starts_afresh: bool) -> None:
         """Turn ``"auto"`` into a number of steps, and check that it fills one batch per task."""
@@ -1109,6 +1139,24 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             _check_saved_tasks(path, task_names_of(env))
         return super().load(path, env=env, **kwargs)
 
+    @classmethod
+    def resume(cls: type[Self], path: str | pathlib.Path, env: GymEnv, **options: Any) -> Self:
+        """Return the model of a run as it was at its newest whole checkpoint, to go on to the bit.
+
+        ::
+
+            model = ARSSAC.resume("runs/mine/checkpoints", env)
+            model.learn(model.remaining_timesteps, callback=..., reset_num_timesteps=False)
+
+        Nothing is unpickled: options that are objects (a learning rate schedule, a class of your own) are given anew.
+
+        :param path: of a run, of its checkpoints (see `RunCheckpoint`), or of one of them
+        :param env: made with the same arguments as the run's; ``n_workers`` may differ
+        :param options: of the constructor, in the place of those that were saved, such as ``device``
+        :raises CheckpointError: if no checkpoint is whole, it is another algorithm's, or other tasks'
+        """
+        return model_of_checkpoint(cls, path, env, options)
+
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Save the replay buffer, as SB3 does; with several tasks straight from memory, without a second copy.
 
@@ -1159,7 +1207,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         ours = ["_update_state", "_task_log", "reward_scale", "timer", "_plan", "_combiner"]
         captured = ["_captured_updates", "_captured_actor", "_stepping_env"]
-        return [*super()._excluded_save_params(), *ours, *captured]
+        resumed = ["last_checkpoint", "rows_on_disk", "_to_restore", "_after_learn"]
+        return [*super()._excluded_save_params(), *ours, *captured, *resumed]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()

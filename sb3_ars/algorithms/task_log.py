@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,20 @@ class TaskLog:
         else:
             th._foreach_add_(self._sums, metrics)
         self._n_updates += 1
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return what was added since the last row; the tensors are not copied."""
+        return {"sums": None if self._sums is None else list(self._sums), "n_updates": self._n_updates}
+
+    def restore_checkpoint_state(self, state: Mapping[str, Any], device: th.device) -> None:
+        """Go on from what :meth:`checkpoint_state` returned.
+
+        :param state: see there
+        :param device: of the model
+        """
+        sums = state["sums"]
+        self._sums = None if sums is None else Metrics(*(tensor.to(device, copy=True) for tensor in sums))
+        self._n_updates = state["n_updates"]
 
     def record(
         self, logger: Logger, n_updates: int, temperature_is_learned: bool, tasks_are_left_out: bool = False

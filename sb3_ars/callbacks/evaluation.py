@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
@@ -63,6 +65,31 @@ class TaskEvalCallback(EventCallback):
         self.best_score = -np.inf
         self.history: list[tuple[int, TaskEvaluation]] = []
         self._next_at = eval_freq
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return what it remembers, for a checkpoint of the run."""
+        columns = [
+            f.name for f in dataclasses.fields(TaskEvaluation) if f.name not in ("protocol", "task_names")
+        ]
+        return {
+            "best_score": float(self.best_score),
+            "history": [
+                {"step": step, **{name: getattr(result, name) for name in columns}}
+                for step, result in self.history
+            ],
+        }
+
+    def restore_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `checkpoint_state` returned.
+
+        :param state: see there
+        """
+        self.best_score = state["best_score"]
+        names = tuple(cast("Any", self.eval_env).task_names)
+        self.history = []
+        for entry in state["history"]:
+            columns = {name: value for name, value in entry.items() if name != "step"}
+            self.history.append((entry["step"], TaskEvaluation(self.protocol, names, **columns)))
 
     def _init_callback(self) -> None:
         check_evaluation_env(self.model, self.eval_env, self.protocol)  # now, not hours later

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 from rich.console import Console
@@ -12,10 +13,15 @@ from sb3_ars.commands.tables import print_evaluation
 from sb3_ars.experiments.config import RunConfig, load_config, load_preset
 from sb3_ars.profiling import PARTS
 
+if TYPE_CHECKING:
+    from sb3_ars.experiments.runner import RunResult
+
 __all__ = ["main"]
 
 _USAGE = """sb3-ars train PRESET [OPTIONS] trains a preset and evaluates it; 'sb3-ars list' shows the presets, and
-'sb3-ars train PRESET --help' a preset's options. A run's config.yaml, or a study's best.yaml, may stand for PRESET."""
+'sb3-ars train PRESET --help' a preset's options. A run's config.yaml, or a study's best.yaml, may stand for PRESET.
+
+sb3-ars train --resume RUN goes on with a run that was killed, stopped or interrupted, given by its folder."""
 
 
 def main(arguments: list[str]) -> int:
@@ -23,6 +29,8 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
+    if arguments and arguments[0] == "--resume":
+        return _resume(arguments[1:])
     if not arguments or arguments[0].startswith("-"):
         print(_USAGE)
         return 0 if arguments and arguments[0] in ("-h", "--help") else 2
@@ -43,7 +51,24 @@ def main(arguments: list[str]) -> int:
     print(
         f"Training {name}: {config.algorithm.total_timesteps:,} environment steps. Ctrl-C ends it early and keeps it."
     )
-    result = train(config, name)
+    _show(train(config, name))
+    return 0
+
+
+def _resume(arguments: list[str]) -> int:
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        print(
+            "sb3-ars train --resume takes one argument, the folder of a run; its options are those in its config.yaml."
+        )
+        return 0 if arguments in (["-h"], ["--help"]) else 2
+    from sb3_ars.experiments.runner import resume  # loads torch
+
+    _show(resume(Path(arguments[0])))
+    return 0
+
+
+def _show(result: RunResult) -> None:
+    """Print what a finished run came to, and where it lies."""
     print_evaluation(result.table, result.protocol)
     if result.seconds_by_part is not None:
         _print_profile(result.seconds_by_part)
@@ -51,7 +76,6 @@ def main(arguments: list[str]) -> int:
     for label, file in (("policy", "policy.zip"), ("picture", "training.png"), ("log", "progress.csv")):
         print(f"  {label:8} {result.folder / file}")
     print(f"  evaluate it again with: sb3-ars evaluate {result.folder}")
-    return 0
 
 
 def _print_profile(seconds_by_part: dict[str, float]) -> None:

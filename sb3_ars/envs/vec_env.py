@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import time
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn, SupportsIndex
 
 import gymnasium as gym
@@ -17,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_ars.envs import checks
 from sb3_ars.envs.adapters import GymVectorTaskEnv, TaskIdWrapper, VecEnvIndices, task_id_space
 from sb3_ars.envs.checks import TaskSpecs
+from sb3_ars.envs.replay import SavedEpisode
 from sb3_ars.envs.workers import Ended, EnvFactory, EnvRunner, StepLayout, TaskEnvs, TimeLimited, WorkerPool
 from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
 
@@ -146,6 +149,49 @@ class MultiTaskVecEnv(VecEnv):
             )
         with self._guarded():
             self._runner.activate(np.isin(self.task_of_env, list(active)))
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return what `restore_checkpoint_state` of an env made like this one needs, as plain values and arrays.
+
+        :raises RuntimeError: before the first `reset`, or while a step is under way
+        """
+        self._check_idle("checkpoint_state")
+        with self._guarded():
+            episodes = self._runner.episodes()
+        if len(episodes) < self.num_envs:
+            raise RuntimeError("checkpoint_state() before reset(): no episode has begun.")
+        # a reset that is asked for but not made yet
+        pending = {"seeds": self._seeds, "options": self._options}
+        return {"episodes": [dataclasses.asdict(episode) for episode in episodes], **pending}
+
+    def restore_checkpoint_state(self, state: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+        """Bring every env to the middle of the episode it was in; return the observations, as `reset` does.
+
+        Each episode is played again: exact for envs that draw from NumPy generators of their own and keep no other
+        memory than plain values from one episode to the next. Others are found out by their last observation, and
+        begin a new episode, with a warning.
+
+        :param state: of `checkpoint_state`, of an env made with the same arguments; ``n_workers`` may differ
+        :raises ConfigError: if it is of another number of envs
+        """
+        self._check_idle("restore_checkpoint_state")
+        if len(state["episodes"]) != self.num_envs:
+            raise ConfigError(
+                f"The checkpoint was made with {len(state['episodes'])} envs, this env has {self.num_envs}; make it "
+                "with the same tasks and n_envs_per_task."
+            )
+        with self._guarded("playing its episodes again"):
+            problems = self._runner.play_again([SavedEpisode.of(episode) for episode in state["episodes"]])
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._seeds, self._options = list(state["seeds"]), list(state["options"])
+        for index, problem in enumerate(problems):
+            if problem is not None:
+                warnings.warn(
+                    f"Env {index} of task {self.task_names[self.task_of_env[index]]!r} begins a new episode instead of "
+                    f"going on: {problem}. So this run will differ from one that was not interrupted.",
+                    stacklevel=2,
+                )
+        return self._observations()
 
     def close(self) -> None:
         """Close the envs and end the workers; may be called twice."""

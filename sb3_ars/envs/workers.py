@@ -26,6 +26,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from sb3_ars.envs.replay import LONGEST_REPLAY, Episode, SavedEpisode, layers, remember_start, restore_start
 from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
 
 __all__ = [
@@ -180,6 +181,12 @@ class EnvRunner(Protocol):
     def step_wait(self) -> list[Ended]:
         """Finish it; the results are in ``arrays``."""
 
+    def episodes(self) -> list[SavedEpisode]:
+        """Return the running episode of every env, between two steps."""
+
+    def play_again(self, episodes: Sequence[SavedEpisode]) -> list[str | None]:
+        """Bring every env to where its episode was; return why not, for those that now begin a new one."""
+
     def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
         """Return the answers of the named envs to a command of `TaskEnvs`."""
 
@@ -203,6 +210,7 @@ class TaskEnvs:
         self._returns = [0.0] * len(tasks)
         self._lengths = [0] * len(tasks)
         self._once = [float("nan")] * len(tasks)
+        self._episodes: list[Episode | None] = [None] * len(tasks)
         self.current = 0
         """Index of the env that was touched last: the one to blame for an exception."""
 
@@ -279,9 +287,7 @@ class TaskEnvs:
             self.current = index
             obs, reward, terminated, truncated, info = env.step(actions[index])
             reward = float(reward)
-            success = self._note_success(index, info)
-            self._returns[index] += reward
-            self._lengths[index] += 1
+            success = self._note_step(index, actions[index], reward, info)
             outcomes[index] = (reward, terminated, truncated, success)
             if terminated or truncated:
                 ended.append(Ended(index, dict(info), self._end_episode(index, obs)))
@@ -291,6 +297,44 @@ class TaskEnvs:
         arrays.rewards[:], arrays.terminated[:], arrays.truncated[:], arrays.success[:] = columns
         self._check_finite([end.env for end in ended], "step")
         return ended
+
+    def episodes(self) -> list[SavedEpisode]:
+        """Return the running episode of every env, between two steps."""
+        rows = zip(self._episodes, self.arrays.obs.copy(), self._returns, strict=True)
+        return [episode.saved(obs, total) for episode, obs, total in rows if episode is not None]
+
+    def play_again(self, episodes: Sequence[SavedEpisode]) -> list[str | None]:
+        """Bring every env to where its episode was; return why not, for those that now begin a new one.
+
+        :param episodes: one per env, of :meth:`episodes`
+        """
+        problems = [self._play_again(index, episode) for index, episode in enumerate(episodes)]
+        for index, problem in enumerate(problems):
+            if problem is not None:
+                self._reset_env(index, None, None)
+        self._check_finite([], "reset")
+        return problems
+
+    def _play_again(self, index: int, saved: SavedEpisode) -> str | None:
+        self.current = index
+        start, actions = saved.start, saved.actions
+        try:
+            restore_start(self._envs[index], start)
+            self._reset_env(index, start.seed, start.options)
+            if actions is None:
+                return f"its episode was longer than {LONGEST_REPLAY:,} steps"
+            for action in actions:
+                obs, reward, terminated, truncated, info = self._envs[index].step(action)
+                self._note_step(index, action, float(reward), info)
+                self._store(self.arrays.obs, index, obs, "step")
+                if terminated or truncated:
+                    return "its episode now ends earlier"
+        except Exception as error:  # an env of somebody else's, in a state it was never asked to be in
+            return f"it raised {type(error).__name__} when its episode was played again: {error}"
+        same = (
+            np.array_equal(self.arrays.obs[index], saved.obs) and self._returns[index] == saved.episode_return
+        )
+        return None if same else "its episode, played again, went another way"
 
     def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
         """Return the answers of the envs at ``indices`` to a command: a method below, without underscore."""
@@ -313,7 +357,9 @@ class TaskEnvs:
 
     def _reset_env(self, index: int, seed: int | None, options: dict[str, Any] | None) -> dict[str, Any]:
         self.current = index
+        episode = Episode(remember_start(self._envs[index], seed, options))
         obs, info = self._envs[index].reset(seed=seed, options=options)
+        self._episodes[index] = episode
         self._returns[index], self._lengths[index], self._once[index] = 0.0, 0, float("nan")
         self._store(self.arrays.obs, index, obs, "reset")
         return dict(info)
@@ -325,6 +371,16 @@ class TaskEnvs:
         arrays.episode_length[index] = self._lengths[index]
         arrays.success_once[index] = self._once[index]
         return self._reset_env(index, None, None)
+
+    def _note_step(
+        self, index: int, action: npt.NDArray[Any], reward: float, info: Mapping[str, Any]
+    ) -> float:
+        episode = self._episodes[index]
+        if episode is not None:
+            episode.add(action)
+        self._returns[index] += reward
+        self._lengths[index] += 1
+        return self._note_success(index, info)
 
     def _note_success(self, index: int, info: Mapping[str, Any]) -> float:
         value = info.get("success", info.get("is_success"))
@@ -382,7 +438,7 @@ class TaskEnvs:
     @staticmethod
     def _is_wrapped(env: gym.Env[Any, Any], wrapper_class: type[Any]) -> bool:
         return any(
-            isinstance(layer, wrapper_class) for layer in _layers(env) if isinstance(layer, gym.Wrapper)
+            isinstance(layer, wrapper_class) for layer in layers(env) if isinstance(layer, gym.Wrapper)
         )
 
     @staticmethod
@@ -471,6 +527,18 @@ class WorkerPool:
         seeds, options = list(seeds), list(options)
         parts = [(seeds[c.start : c.stop], options[c.start : c.stop]) for c in self._chunks]
         self._command([("reset", part) for part in parts], "resetting its envs")
+        return self._take_lists()
+
+    def episodes(self) -> list[SavedEpisode]:
+        """Return the running episode of every env, between two steps."""
+        self._command([("episodes", ())] * len(self._chunks), "telling where its episodes are")
+        return self._take_lists()
+
+    def play_again(self, episodes: Sequence[SavedEpisode]) -> list[str | None]:
+        """Bring every env to where its episode was; return why not, for those that now begin a new one."""
+        parts = [(episodes[c.start : c.stop],) for c in self._chunks]
+        self._send_all([("play_again", part) for part in parts])
+        self._collect(max(START_TIMEOUT, self._timeout), "playing its episodes again")
         return self._take_lists()
 
     def step_async(self) -> None:
@@ -736,7 +804,7 @@ def _dumps(value: Any) -> bytes:
 
 def _facts(env: gym.Env[Any, Any]) -> EnvFacts:
     # by name, so that nothing need be imported; a user's own kind of a normaliser is one too
-    classes = (cls.__name__ for layer in _layers(env) for cls in type(layer).__mro__)
+    classes = (cls.__name__ for layer in layers(env) for cls in type(layer).__mro__)
     normalizers = [name for name in classes if name in REWARD_NORMALIZERS]
     return EnvFacts(
         env.observation_space,
@@ -765,13 +833,6 @@ def _max_episode_steps(env: gym.Env[Any, Any]) -> int | None:
             value = env.get_wrapper_attr(name)
             return int(value) if isinstance(value, int | np.integer) else None
     return env.spec.max_episode_steps if env.spec is not None else None
-
-
-def _layers(env: gym.Env[Any, Any]) -> Iterator[gym.Env[Any, Any]]:
-    yield env
-    while isinstance(env, gym.Wrapper):
-        env = env.env
-        yield env
 
 
 def _work(line: _Line, stale: Sequence[Connection], envs: TaskEnvs) -> None:

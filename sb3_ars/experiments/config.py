@@ -21,6 +21,7 @@ from sb3_ars.experiments.catalogue import preset_values
 __all__ = [
     "NO_PART_OF_A_METHOD",
     "AlgorithmConfig",
+    "CheckpointConfig",
     "EnvConfig",
     "EvaluationConfig",
     "PolicyConfig",
@@ -50,6 +51,9 @@ NO_PART_OF_A_METHOD = (
     "profile",
     "env.n_workers",
     "evaluation.every",
+    "checkpoint.every",
+    "checkpoint.every_minutes",
+    "checkpoint.keep",
 )
 """Options in which runs of one method may differ: which run it is, where it goes, how often it is looked at, and by
 how many processes its environments are stepped."""
@@ -215,6 +219,29 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True)
+class CheckpointConfig:
+    """When a run is saved, so that sb3-ars train --resume goes on exactly; removed once it has finished."""
+
+    every: int | None = None
+    """Environment steps, summed over tasks, between two checkpoints; None does not count them."""
+    every_minutes: float | None = 10.0
+    """Minutes of training between two checkpoints; None does not look at the clock."""
+    keep: int = 2
+    """Newest checkpoints that stay."""
+
+    def __post_init__(self) -> None:
+        if self.every is not None:
+            check_count("checkpoint.every", self.every)
+        check_count("checkpoint.keep", self.keep)
+        minutes: Any = self.every_minutes
+        is_number = isinstance(minutes, int | float) and not isinstance(minutes, bool)
+        if minutes is not None and (not is_number or not minutes > 0):
+            raise ConfigError(
+                f"checkpoint.every_minutes={minutes!r} must be a positive number of minutes, or None."
+            )
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """One training run."""
 
@@ -236,6 +263,7 @@ class RunConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
 
 
 def load_preset(name: str) -> RunConfig:

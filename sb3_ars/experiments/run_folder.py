@@ -18,13 +18,27 @@ import pandas as pd
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.config import RunConfig, load_config
 
-__all__ = ["FORMAT", "RESULT", "Run", "find_runs", "is_finished", "read_run", "write_json", "write_whole"]
+__all__ = [
+    "CHECKPOINTS",
+    "FORMAT",
+    "RESULT",
+    "Run",
+    "find_runs",
+    "is_finished",
+    "read_run",
+    "write_json",
+    "write_whole",
+]
 
 FORMAT = 1
 """Version of the folder's layout; a change that an older reader would misread raises it."""
 
 RESULT = "result.json"
 """Written last and whole: a folder with it holds a finished run."""
+
+
+CHECKPOINTS = "checkpoints"
+"""Folder of a run that is not finished, which resuming starts from."""
 
 
 @dataclass(frozen=True)

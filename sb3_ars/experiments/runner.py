@@ -13,15 +13,17 @@ from typing import Any
 import pandas as pd
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from sb3_ars.algorithms.checkpoint import load_checkpoint
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.algorithms.sac import ARSSAC
 from sb3_ars.algorithms.tqc import ARSTQC
+from sb3_ars.callbacks.checkpoint import RunCheckpoint
 from sb3_ars.callbacks.evaluation import TaskEvalCallback
 from sb3_ars.callbacks.schedule import TaskScheduleCallback
+from sb3_ars.checkpoints import Checkpoint, latest_checkpoint
 from sb3_ars.envs import make_metaworld_env, make_toy_env
 from sb3_ars.errors import ConfigError
 from sb3_ars.evaluation import (
@@ -32,8 +34,9 @@ from sb3_ars.evaluation import (
     make_evaluation_env,
 )
 from sb3_ars.experiments.config import Activation, BodyOptions, RunConfig, load_config, save_config
+from sb3_ars.experiments.logs import PROGRESS, continued_logger, new_logger
 from sb3_ars.experiments.plots import plot_training
-from sb3_ars.experiments.run_folder import FORMAT, RESULT, write_json
+from sb3_ars.experiments.run_folder import CHECKPOINTS, FORMAT, RESULT, is_finished, read_run, write_json
 from sb3_ars.profiling import PartTimer
 from sb3_ars.versions import run_versions
 
@@ -45,6 +48,7 @@ __all__ = [
     "load_policy",
     "make_env",
     "method_callbacks",
+    "resume",
     "train",
 ]
 
@@ -79,7 +83,8 @@ def train(
 ) -> RunResult:
     """Train as configured, evaluate, and write the run's folder.
 
-    An interrupt (Ctrl-C) ends training early; what was learned is evaluated and saved like a finished run.
+    An interrupt (Ctrl-C) ends training early; what was learned is evaluated and saved like a finished run. SIGTERM ends
+    it at once. Both leave a checkpoint, from which :func:`resume` goes on.
 
     :param config: of the run
     :param name: of the preset, for the folder's name
@@ -89,40 +94,85 @@ def train(
         ``on_step`` returns ``False`` training ends early
     :raises ConfigError: before training, if an option cannot work or the folder cannot be written
     """
-    protocol = protocol_of(config)
-    if config.algorithm.device.startswith("cuda") and not th.cuda.is_available():
-        raise ConfigError(
-            f"algorithm.device={config.algorithm.device!r}, but torch finds no GPU here; use 'auto' or 'cpu'."
-        )
     folder = _make_folder(
         _free_folder(config.output / f"{name}-seed{config.seed}") if folder is None else folder
     )
     with ExitStack() as stack:
         stack.callback(_remove_if_unused, folder)
+        return _run(config, name, folder, None, progress_bar, after_evaluation)
+
+
+def resume(folder: Path, progress_bar: bool = True) -> RunResult:
+    """Go on with a run that was killed, stopped or interrupted, from its newest whole checkpoint, to its end.
+
+    :param folder: of the run
+    :param progress_bar: whether to show one
+    :raises ConfigError: if it has finished, holds no checkpoint, or was trained with another configuration
+    """
+    config = load_config(folder / "config.yaml")
+    if is_finished(folder) and not read_run(folder).result.get("interrupted"):
+        raise ConfigError(f"The run in {folder} has finished; there is nothing to resume. Train a new one.")
+    checkpoint = latest_checkpoint(folder / CHECKPOINTS)
+    (folder / RESULT).unlink(missing_ok=True)  # of the run as it was when it was interrupted
+    return _run(
+        config, str(checkpoint.notes.get("name", folder.name)), folder, checkpoint, progress_bar, None
+    )
+
+
+def _run(
+    config: RunConfig,
+    name: str,
+    folder: Path,
+    checkpoint: Checkpoint | None,
+    progress_bar: bool,
+    after_evaluation: BaseCallback | None,
+) -> RunResult:
+    """Train, from the beginning or from a checkpoint, evaluate, and write the folder."""
+    protocol = protocol_of(config)
+    if config.algorithm.device.startswith("cuda") and not th.cuda.is_available():
+        raise ConfigError(
+            f"algorithm.device={config.algorithm.device!r}, but torch finds no GPU here; use 'auto' or 'cpu'."
+        )
+    with ExitStack() as stack:
         env = stack.enter_context(closing(make_env(config)))
         model = build_model(config, env, verbose=1)
         evaluation_env = stack.enter_context(closing(_make_evaluation_env(config, protocol)))
-        save_config(config, folder / "config.yaml")
-        write_json(folder / "versions.json", run_versions())
-        model.set_logger(
-            configure(str(folder), ["csv", "tensorboard", *(["stdout"] if config.verbose else [])])
-        )
+        to_screen = bool(config.verbose)
+        if checkpoint is None:
+            save_config(config, folder / "config.yaml")
+            write_json(folder / "versions.json", run_versions())
+            model.set_logger(new_logger(folder, to_screen))
+        else:
+            load_checkpoint(model, checkpoint)
+            print(f"Going on at step {model.num_timesteps:,}, from {checkpoint.folder}.")
+            model.set_logger(
+                continued_logger(folder, to_screen, checkpoint.folder / PROGRESS, model.num_timesteps)
+            )
         stack.callback(model.logger.close)
-        started = time.monotonic()
         timer = PartTimer(model.device) if config.profile else None
         model.timer = timer or model.timer
-        interrupted = _learn(model, config, evaluation_env, protocol, folder, progress_bar, after_evaluation)
-        seconds = time.monotonic() - started
+        checkpoints = RunCheckpoint(
+            folder / CHECKPOINTS,
+            **dataclasses.asdict(config.checkpoint),
+            notes={"name": name},
+            files=[folder / PROGRESS],
+        )
+        interrupted = _learn(
+            model, config, evaluation_env, protocol, folder, checkpoints, progress_bar, after_evaluation
+        )
+        seconds = checkpoints.seconds
         by_part = timer.seconds() if timer else None
         model.save(folder / "policy")
         evaluations = _evaluate_both(model, evaluation_env, protocol, progress_bar)
         table = final_table(evaluations, model.reward_scale.scale.tolist())
         names = list(evaluations[True].task_names)
-        plot_training(folder / "progress.csv", names, model.reward_scale_history, folder / "training.png")
+        plot_training(folder / PROGRESS, names, model.reward_scale_history, folder / "training.png")
         table.to_csv(folder / "evaluation.csv")
         write_json(
             folder / RESULT, _result(name, config, table, protocol, model, seconds, by_part, interrupted)
         )
+    if not interrupted:
+        shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)  # gigabytes that nothing needs any more
     return RunResult(folder, table, protocol.describe(), seconds, by_part)
 
 
@@ -263,12 +313,13 @@ def _learn(
     evaluation_env: VecEnv,
     protocol: EvaluationProtocol,
     folder: Path,
+    checkpoints: RunCheckpoint,
     progress_bar: bool,
     after_evaluation: BaseCallback | None,
 ) -> bool:
-    """Train; return whether the user interrupted."""
+    """Train, or go on; return whether the user interrupted."""
     bar = ProgressBarCallback()
-    callbacks = [*([bar] if progress_bar else []), *method_callbacks(config)]
+    callbacks = [*([bar] if progress_bar else []), *method_callbacks(config), checkpoints]
     if config.evaluation.every is not None:
         callbacks.append(
             TaskEvalCallback(
@@ -282,12 +333,23 @@ def _learn(
         )
     interrupted = False
     try:
-        model.learn(config.algorithm.total_timesteps, callback=callbacks, log_interval=config.log_interval)
+        model.learn(
+            config.algorithm.total_timesteps - model.num_timesteps,
+            callback=callbacks,
+            log_interval=config.log_interval,
+            reset_num_timesteps=model.num_timesteps == 0,
+        )
     except KeyboardInterrupt:
         if model.replay_buffer is None or model.replay_buffer.size() == 0:
             raise
         interrupted = True
-        print(f"\nInterrupted at step {model.num_timesteps:,}; evaluating and saving what was learned.")
+        print(
+            f"\nInterrupted at step {model.num_timesteps:,}; evaluating and saving what was learned. "
+            f"Go on with: sb3-ars train --resume {folder}"
+        )
+    except SystemExit:  # told to end, and at once
+        print(f"\nStopped at step {model.num_timesteps:,}. Go on with: sb3-ars train --resume {folder}")
+        raise
     except Exception:
         if model.num_timesteps > 0:
             model.save(folder / "policy")
@@ -304,7 +366,7 @@ def _learn(
 
 def _remove_if_unused(folder: Path) -> None:
     """Leave no folder behind where training never began."""
-    if not (folder / "policy.zip").exists():
+    if not (folder / "policy.zip").exists() and not any((folder / CHECKPOINTS).glob("step-*")):
         shutil.rmtree(folder, ignore_errors=True)
 
 

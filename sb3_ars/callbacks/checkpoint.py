@@ -1,0 +1,176 @@
+"""Writes checkpoints while a model learns, also when the process is told to end; what they hold is not known here."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, cast
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_ars.algorithms.checkpoint import write_checkpoint
+from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
+from sb3_ars.algorithms.run_state import check_can_be_captured
+from sb3_ars.checkpoints import CheckpointFolder
+from sb3_ars.errors import ConfigError, check_count
+
+__all__ = ["RunCheckpoint"]
+
+
+class RunCheckpoint(BaseCallback):
+    """Write exact checkpoints, from which ``ARSSAC.resume`` goes on as if nothing had happened.
+
+    One is written whenever ``every`` environment steps or ``every_minutes`` have passed since the last, and when the
+    process gets SIGTERM or Ctrl-C: then training stops between two steps, the checkpoint is written, and SystemExit or
+    KeyboardInterrupt is raised; a second Ctrl-C does not wait. Writing changes nothing that is learned. Each is written
+    whole or not at all, and adds only the transitions that are new.
+
+    A disk that is full or gone is a warning, and training goes on; the checkpoints there were stay.
+
+    :param folder: for the checkpoints, such as ``runs/mine/checkpoints``
+    :param every: environment steps, summed over environments, between two checkpoints; ``None`` does not count them
+    :param every_minutes: minutes of training between two checkpoints; ``None`` does not look at the clock
+    :param keep: newest checkpoints that stay
+    :param handle_signals: whether SIGTERM and Ctrl-C end training with a checkpoint
+    :param notes: plain values to write into each manifest
+    :param files: of the run, such as its log: each checkpoint keeps a copy of those there are
+    :param verbose: 1 prints each checkpoint
+    :raises ConfigError: if an option cannot work, or both intervals are ``None`` and signals are not handled
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        every: int | None = None,
+        every_minutes: float | None = 10.0,
+        keep: int = 2,
+        handle_signals: bool = True,
+        notes: Mapping[str, Any] | None = None,
+        files: Sequence[str | Path] = (),
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if every is not None:
+            check_count("every", every)
+        is_number = isinstance(every_minutes, int | float) and not isinstance(every_minutes, bool)
+        if every_minutes is not None and (not is_number or not every_minutes > 0):
+            raise ConfigError(
+                f"every_minutes={every_minutes!r} must be a positive number of minutes, or None."
+            )
+        if every is None and every_minutes is None and not handle_signals:
+            raise ConfigError(
+                "every=None, every_minutes=None and handle_signals=False would never write a checkpoint."
+            )
+        self.folder = Path(folder)
+        self.every, self.every_minutes, self.handle_signals = every, every_minutes, handle_signals
+        self.notes, self.files = dict(notes or {}), [Path(file) for file in files]
+        self.seconds = 0.0
+        """Time spent in training, of what a run was resumed from too."""
+        self._folder = CheckpointFolder(self.folder, check_count("keep", keep))
+        self._told: signal.Signals | None = None
+        self._next_step: float = 0
+        self._next_time = self._counted_at = 0.0
+
+    @property
+    def algorithm(self) -> MultiTaskOffPolicyAlgorithm:
+        """The model, typed."""
+        return cast("MultiTaskOffPolicyAlgorithm", self.model)
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, MultiTaskOffPolicyAlgorithm):
+            raise ConfigError(
+                f"RunCheckpoint knows the state of ARSSAC and ARSTQC, not of {type(self.model).__name__}; use SB3's "
+                "CheckpointCallback."
+            )
+        if (
+            self.parent is not None
+        ):  # SB3 2.9.2 (callbacks.py) forwards no rollout hooks to an event's children
+            raise ConfigError(
+                "A RunCheckpoint inside an event callback is never told of rollouts, so it would never write; pass it "
+                "to learn() directly or in a list."
+            )
+        check_can_be_captured(self.model)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"The folder of checkpoints {self.folder} cannot be made ({error.strerror}); choose another."
+            ) from error
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return what it remembers, for a checkpoint of the run."""
+        self._count_seconds()
+        return {"seconds": self.seconds}
+
+    def restore_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `checkpoint_state` returned.
+
+        :param state: see there
+        """
+        self.seconds = state["seconds"]
+
+    def _count_seconds(self) -> None:
+        now = time.monotonic()
+        self.seconds += now - self._counted_at
+        self._counted_at = now
+
+    def _on_training_start(self) -> None:
+        self._told = None
+        self._counted_at = time.monotonic()
+        self.algorithm.after_learn(self._count_seconds)
+        self._wait_again()
+        if self.handle_signals and threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                before = signal.signal(number, self._on_signal)
+                self.algorithm.after_learn(signal.signal, number, before)
+
+    def _on_rollout_start(self) -> None:
+        is_due = self.num_timesteps >= self._next_step or time.monotonic() >= self._next_time
+        if is_due or self._told is not None:
+            self._write()
+            self._wait_again()
+        if self._told is signal.SIGINT:
+            raise KeyboardInterrupt
+        if self._told is not None:
+            raise SystemExit(128 + self._told)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _write(self) -> None:
+        started = time.monotonic()
+        try:
+            path = write_checkpoint(
+                self.algorithm, self._folder, self.locals.get("callback"), self.notes, self.files
+            )
+        except OSError as error:
+            last = self.algorithm.last_checkpoint
+            warnings.warn(
+                f"The checkpoint at step {self.num_timesteps:,} could not be written to {self.folder} "
+                f"({error.strerror or error}). Training goes on; "
+                + (f"the last good one is {last}." if last else "there is none yet.")
+                + " Free some space: the next one is tried when it is due.",
+                stacklevel=2,
+            )
+            return
+        self.algorithm.last_checkpoint = path
+        if self.verbose >= 1:
+            print(f"Step {self.num_timesteps:,}: checkpoint in {path} ({time.monotonic() - started:.1f} s)")
+
+    def _wait_again(self) -> None:
+        never = float("inf")
+        self._next_step = never if self.every is None else self.num_timesteps + self.every
+        minutes = self.every_minutes
+        self._next_time = never if minutes is None else time.monotonic() + 60.0 * minutes
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        told = signal.Signals(number)
+        if self._told is signal.SIGINT and told is signal.SIGINT:
+            raise KeyboardInterrupt
+        self._told = told
+        print(f"\n{told.name}: a checkpoint is written as soon as this step is done.", flush=True)
