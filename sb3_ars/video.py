@@ -23,8 +23,9 @@ from sb3_ars.envs.rendering import DEFAULT_CAMERA
 from sb3_ars.envs.toy import TOY_TASKS
 from sb3_ars.errors import ConfigError, check_count, nearest
 from sb3_ars.evaluation import EvaluationProtocol, Policy, make_evaluation_env, prepare_evaluation_env
-from sb3_ars.experiments.run_folder import read_run, write_whole
+from sb3_ars.experiments.run_folder import read_run
 from sb3_ars.experiments.runner import load_policy, protocol_of
+from sb3_ars.files import write_whole
 
 __all__ = ["Recording", "VideoFormat", "record", "record_episodes", "record_run", "write_video"]
 

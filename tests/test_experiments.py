@@ -15,8 +15,9 @@ from sb3_ars.cli import main
 from sb3_ars.errors import ConfigError, WorkerError
 from sb3_ars.experiments import runner
 from sb3_ars.experiments.config import RunConfig, ScheduleConfig, load_config, load_preset, save_config
-from sb3_ars.experiments.run_folder import write_json, write_whole
+from sb3_ars.experiments.run_folder import write_json
 from sb3_ars.experiments.runner import build_model, train
+from sb3_ars.files import write_whole
 
 
 def tiny_toy(**algorithm):
