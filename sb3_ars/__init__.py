@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sb3_ars.envs import make_metaworld_env, make_multitask_env, make_toy_env
     from sb3_ars.errors import CheckpointError, ConfigError, DivergedError, EnvContractError, WorkerError
     from sb3_ars.evaluation import evaluate_tasks
+    from sb3_ars.policy_file import LoadedPolicy, export_policy, load_policy
 
 __version__ = "0.1.0"
 
@@ -43,6 +44,9 @@ _MODULE_OF = {
     "EnvContractError": "errors",
     "WorkerError": "errors",
     "evaluate_tasks": "evaluation",
+    "LoadedPolicy": "policy_file",
+    "export_policy": "policy_file",
+    "load_policy": "policy_file",
 }
 
 __all__ = [
@@ -54,6 +58,7 @@ __all__ = [
     "ConfigError",
     "DivergedError",
     "EnvContractError",
+    "LoadedPolicy",
     "RunCheckpoint",
     "SMTConfig",
     "TaskEvalCallback",
@@ -61,6 +66,8 @@ __all__ = [
     "TaskScheduleCallback",
     "WorkerError",
     "evaluate_tasks",
+    "export_policy",
+    "load_policy",
     "make_metaworld_env",
     "make_multitask_env",
     "make_toy_env",

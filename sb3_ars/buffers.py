@@ -43,6 +43,7 @@ _REBUILT = (  # attributes made anew from the rest when a pickle is loaded
 )
 _MAGIC = b"\xa5sb3_ars task buffer 1\n"  # its first byte is no pickle's
 _PICKLE = b"\x80"  # a pickle's first byte
+_MAX_HEADER = 2**20  # bytes of a file's header, which has a few thousand beside the names of the tasks
 _CHUNK_BYTES = 2**24  # what passes through host memory at once when a buffer on a GPU is saved or loaded
 _SLOTS_PER_FRAME = 256  # a table that starts this large holds the ends of episodes at least this long
 
@@ -377,8 +378,8 @@ class TaskReplayBuffer(ReplayBuffer):
         stay this buffer's. A buffer of the same size stays where it is in memory.
 
         :param file: open for reading bytes
-        :raises ConfigError: if the file is no such buffer, was cut off, or holds other tasks or shapes; this buffer
-            is then as it was. If reading fails half-way, it is empty.
+        :raises ConfigError: if the file is no such buffer, was cut off or damaged, or holds other tasks or shapes; this
+            buffer is then as it was. If reading fails half-way or meets NaN or infinity, it is empty.
         """
         source = getattr(file, "name", "the given file")
         header = _read_header(file, source)
@@ -390,10 +391,16 @@ class TaskReplayBuffer(ReplayBuffer):
                 for chunk in _chunks(part):
                     host = chunk if chunk.device.type == "cpu" else th.empty_like(chunk, device="cpu")
                     _read_exactly(file, host.numpy().data.cast("B"), source)
+                    if part.shape[1] == self._row_width:  # of frames, unused ones may be anything
+                        _check_numbers(host[:, : self._row_width - self.optimize_memory_usage], source)
                     chunk.copy_(host)
             self._restore_frames(header, source)
-        except BaseException:
+        except BaseException as error:
             self.reset()
+            if isinstance(error, MemoryError | RuntimeError):  # torch has one of the latter where memory ends
+                raise ConfigError(
+                    f"The replay buffer in {source} cannot be held ({error}); this one is now empty."
+                ) from error
             raise
 
     # ------------------------------------------------------------------ checkpoints
@@ -437,7 +444,7 @@ class TaskReplayBuffer(ReplayBuffer):
         :raises ConfigError: if a file ends too early, or the parts leave a gap; this buffer is then empty
         """
         check_count("buffer_size", state["buffer_size"])
-        self._check_numbers(state["task_total"])
+        self._check_counts(state["task_total"])
         self.reset()
         if state["buffer_size"] != self.buffer_size:
             self._release_storage()
@@ -470,7 +477,7 @@ class TaskReplayBuffer(ReplayBuffer):
         ]
         for file, first, stop in parts:
             for numbers in (first, stop):
-                self._check_numbers(numbers)
+                self._check_counts(numbers)
             source = getattr(file, "name", "the given file")
             for task, (start, end) in enumerate(zip(first, stop, strict=True)):
                 wanted = min(max(start, int(expected[task])), end)
@@ -490,7 +497,7 @@ class TaskReplayBuffer(ReplayBuffer):
         if missing:
             raise ConfigError(f"The checkpoint lacks the newest transitions of {', '.join(missing)}.")
 
-    def _check_numbers(self, numbers: Sequence[int]) -> None:
+    def _check_counts(self, numbers: Sequence[int]) -> None:
         if len(numbers) != self.n_tasks:
             raise ConfigError(
                 f"The checkpoint counts transitions of {len(numbers)} tasks, not of {self.n_tasks}."
@@ -571,7 +578,7 @@ class TaskReplayBuffer(ReplayBuffer):
             observation_shape=list(self.observation_space.shape or ()),
             action_shape=list(self.action_space.shape or ()),
             optimize_memory_usage=self.optimize_memory_usage,
-            handle_timeout_termination=self.handle_timeout_termination,
+            handle_timeout_termination=bool(self.handle_timeout_termination),
             buffer_size=int(self.buffer_size),
             task_size=self.task_size.tolist(),
             task_pos=self.task_pos.tolist(),
@@ -609,6 +616,24 @@ class TaskReplayBuffer(ReplayBuffer):
                 f"the model with optimize_memory_usage={header.optimize_memory_usage}."
             )
         _check_task_of_env(self.task_of_env.tolist(), self.n_tasks, header.buffer_size)
+        total, needed = self._total_memory(), 4 * self.n_tasks * header.buffer_size * self._row_width
+        if needed > total:
+            raise ConfigError(
+                f"The replay buffer in {source} has buffer_size={header.buffer_size:_}, which takes "
+                f"{needed / 1e9:.2f} GB, but the device has {total / 1e9:.2f} GB."
+            )
+        if header.generator_device == self._device.type:
+            try:
+                self._make_generator().set_state(header.random_state())
+            except (ValueError, TypeError, RuntimeError) as error:
+                raise ConfigError(
+                    f"{source} is damaged: generator_state is none of a generator ({error}). Use another save."
+                ) from error
+
+    def _total_memory(self) -> int:
+        if self._device.type == "cuda":
+            return int(th.cuda.mem_get_info(self._device)[1])
+        return int(psutil.virtual_memory().total)
 
     def _check_length(self, file: Any, header: _Header, source: str) -> None:
         """Raise if a file is shorter than its header says, before anything here is overwritten."""
@@ -639,8 +664,7 @@ class TaskReplayBuffer(ReplayBuffer):
         self.seed = header.seed
         self._generator.manual_seed(self.seed)
         if header.generator_device == self._device.type:
-            state = np.frombuffer(base64.b64decode(header.generator_state), np.uint8)
-            self._generator.set_state(th.from_numpy(state.copy()))
+            self._generator.set_state(header.random_state())
         if self.task_size.any():
             self._allocate()
         if self._frames is not None and self._frames.reserve(header.n_frames):
@@ -656,6 +680,7 @@ class TaskReplayBuffer(ReplayBuffer):
         )
         if not self._frames.restore(rings, self.buffer_size, header.n_frames):
             raise ConfigError(f"{source} is damaged: a frame it points to is not there. Use another save.")
+        _check_numbers(self._frames.table[self._frames.kept_rows()], source)
 
     # ------------------------------------------------------------------ private: memory
 
@@ -971,6 +996,10 @@ class _FrameTable:
         )
         return np.array(rows, dtype=np.int32)
 
+    def kept_rows(self) -> list[int]:
+        """Return the rows of transitions that keep theirs until they are overwritten."""
+        return [*self._row_of_slot.values()]
+
     def to(self, device: th.device) -> _FrameTable:
         """Move the table and return it.
 
@@ -1062,12 +1091,30 @@ class _Header:
     generator_state: str
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, kind = getattr(self, field.name), str(field.type)
+            values = value if kind.startswith("list") else [value]
+            wanted = {"str": str, "int": int, "bool": bool}[kind.removeprefix("list[").removesuffix("]")]
+            if not isinstance(values, list) or any(
+                not isinstance(one, wanted) or (wanted is int and isinstance(one, bool)) for one in values
+            ):
+                raise TypeError(f"{field.name} is no {kind}")
         n_tasks, slots = len(self.task_names), self.buffer_size
-        counts = all(0 <= size <= slots for size in self.task_size) and all(
-            0 <= pos < slots for pos in self.task_pos
+        counts = all(
+            0 <= size <= slots and 0 <= pos < slots and (size == slots or pos == size)
+            for size, pos in zip(self.task_size, self.task_pos, strict=True)
         )
-        if not counts or not len(self.task_size) == len(self.task_pos) == n_tasks:
+        if not counts or len(self.task_size) != n_tasks:
             raise ValueError(f"{self.task_size} of {slots} slots, at {self.task_pos}, for {n_tasks} tasks")
+        # every slot and, twice, every environment may have a frame; there are no more environments than slots
+        if not 0 <= self.n_frames <= 3 * n_tasks * slots * self.optimize_memory_usage:
+            raise ValueError(f"{self.n_frames} frames of {n_tasks} tasks with {slots} slots")
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"a seed of {self.seed}")
+
+    def random_state(self) -> th.Tensor:
+        """Return the generator's state."""
+        return th.from_numpy(np.frombuffer(base64.b64decode(self.generator_state), np.uint8).copy())
 
 
 def _read_header(file: Any, source: str) -> _Header:
@@ -1079,12 +1126,23 @@ def _read_header(file: Any, source: str) -> _Header:
         raise ConfigError(
             f"{source} {what}. Load it with the model and version that saved it, or collect anew."
         )
+    length = int.from_bytes(file.read(8), "little")
     try:
-        return _Header(**json.loads(file.read(int.from_bytes(file.read(8), "little"))))
-    except (TypeError, ValueError) as error:
+        if length > _MAX_HEADER:
+            raise ValueError(f"a header of {length:,} bytes")
+        return _Header(**json.loads(file.read(length)))
+    except (TypeError, ValueError, RecursionError) as error:
         raise ConfigError(
             f"{source} was cut off or damaged within its first lines ({error}). Use another save."
         ) from error
+
+
+def _check_numbers(rows: th.Tensor, source: str) -> None:
+    if not th.isfinite(rows).all():
+        raise ConfigError(
+            f"{source} is damaged: it holds NaN or infinity, which no buffer stores. The replay buffer is now empty. "
+            "Use another save."
+        )
 
 
 def _read_exactly(file: Any, memory: memoryview, source: str) -> None:

@@ -23,8 +23,9 @@ from sb3_ars.envs.rendering import DEFAULT_CAMERA
 from sb3_ars.envs.toy import TOY_TASKS
 from sb3_ars.errors import ConfigError, check_count, nearest
 from sb3_ars.evaluation import EvaluationProtocol, Policy, make_evaluation_env, prepare_evaluation_env
-from sb3_ars.experiments.run_folder import read_run, write_whole
-from sb3_ars.experiments.runner import load_policy, protocol_of
+from sb3_ars.experiments.run_folder import read_run
+from sb3_ars.experiments.runner import load_model, protocol_of
+from sb3_ars.files import write_whole
 
 __all__ = ["Recording", "VideoFormat", "record", "record_episodes", "record_run", "write_video"]
 
@@ -150,7 +151,7 @@ def record_run(
         rendering["camera"] = camera
         env = make_evaluation_env(list(names), protocol, n_workers=0, **rendering)
     with closing(env):
-        model = load_policy(folder / "policy.zip", run.config)
+        model = load_model(folder / "policy.zip", run.config)
         for name, file in zip(chosen, files, strict=True):
             recording = _record(model, name, env, n_episodes, deterministic, seed, fps, caption=True)
             write_video(file, recording.frames, recording.fps)

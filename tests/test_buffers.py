@@ -2,7 +2,9 @@
 
 import copy
 import io
+import json
 import pickle
+import random
 
 import numpy as np
 import pytest
@@ -582,6 +584,179 @@ def test_a_file_that_does_not_fit_is_refused_and_nothing_is_lost(change, message
     with pytest.raises(ConfigError, match=message):
         buffer.read_from(io.BytesIO(refused_file(change)))
     assert pickle.dumps(buffer) == before
+
+
+def with_header(content, **changes):
+    """A saved buffer with something else in its header; what is no mapping takes the header's place."""
+    start = content.index(b"\n") + 1
+    end = start + 8 + int.from_bytes(content[start : start + 8], "little")
+    header = json.loads(content[start + 8 : end]) | changes
+    text = json.dumps(changes.get("instead", header)).encode()
+    return content[:start] + len(text).to_bytes(8, "little") + text + content[end:]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"instead": []}, "damaged within its first lines"),
+        ({"instead": "text"}, "damaged within its first lines"),
+        ({"more": 1}, "damaged within its first lines .*unexpected keyword argument 'more'"),
+        ({"task_names": 2}, r"task_names is no list\[str\]"),
+        ({"observation_shape": 5}, r"observation_shape is no list\[int\]"),
+        ({"action_shape": [2.0]}, r"action_shape is no list\[int\]"),
+        ({"task_size": [True, 3]}, r"task_size is no list\[int\]"),
+        ({"task_size": [3]}, "damaged within its first lines"),
+        ({"task_pos": [3, 4]}, r"\[3, 3\] of 5 slots, at \[3, 4\]"),
+        ({"task_pos": [3, -1]}, r"at \[3, -1\]"),
+        ({"optimize_memory_usage": 0}, "optimize_memory_usage is no bool"),
+        ({"handle_timeout_termination": "no"}, "handle_timeout_termination is no bool"),
+        ({"buffer_size": 5.0}, "buffer_size is no int"),
+        ({"buffer_size": None}, "buffer_size is no int"),
+        (
+            {"buffer_size": 10**15},
+            r"has buffer_size=1_000_000_000_000_000, which takes .* GB, but the device has",
+        ),
+        ({"n_frames": -1}, "-1 frames"),
+        ({"n_frames": 1}, "1 frames"),
+        ({"seed": "1"}, "seed is no int"),
+        ({"seed": 2**64}, "a seed of 18446744073709551616"),
+        ({"seed": -1}, "a seed of -1"),
+        ({"generator_device": 0}, "generator_device is no str"),
+        ({"generator_state": [1, 2]}, "generator_state is no str"),
+        ({"generator_state": "x"}, "is damaged: generator_state is none of a generator"),
+        ({"generator_state": "\u2603"}, "is damaged: generator_state is none of a generator"),
+        ({"generator_state": "AAAA"}, "is damaged: generator_state is none of a generator"),
+        ({"generator_state": "A" * 6744}, "is damaged: generator_state is none of a generator"),
+        (
+            {"generator_state": "A" * 6742 + "=="},
+            "is damaged: generator_state is none .*nvalid mt19937 state",
+        ),
+    ],
+)
+def test_a_header_that_lies_is_refused_and_nothing_is_lost(changes, message):
+    buffer = fill(make_buffer(seed=1), 4)
+    before = pickle.dumps(buffer)
+    for kind in (io.BytesIO, Pipe):
+        with pytest.raises(ConfigError, match=message):
+            buffer.read_from(kind(with_header(saved(fill(make_buffer(), 3)), **changes)))
+        assert pickle.dumps(buffer) == before
+
+
+@pytest.mark.parametrize("length", [2**20 + 1, 2**40, 2**63 - 1, 2**64 - 1])
+def test_a_header_that_would_be_huge_is_not_read(length):
+    content = saved(fill(make_buffer(), 3))
+    start = content.index(b"\n") + 1
+    file = io.BytesIO(content[:start] + length.to_bytes(8, "little") + b"[" * 2**21)
+    with pytest.raises(ConfigError, match=f"a header of {length:,} bytes"):
+        make_buffer().read_from(file)
+    assert file.tell() == start + 8
+
+
+def test_a_header_nested_without_end_is_refused():
+    start = saved(make_buffer()).index(b"\n") + 1
+    content = saved(make_buffer())[:start] + (10**5).to_bytes(8, "little") + b"[" * 10**5
+    with pytest.raises(ConfigError, match="damaged within its first lines"):
+        make_buffer().read_from(io.BytesIO(content))
+
+
+@KINDS
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_numbers_that_no_buffer_stores_are_not_read(optimize, value):
+    good = saved(fill(make_buffer(optimize_memory_usage=optimize), 3))
+    row = 4 * make_buffer(optimize_memory_usage=optimize)._row_width
+    first_row = len(good) - 2 * 3 * row - (2 * 3 * 4 * OBS_DIM if optimize else 0)
+    places = [first_row, first_row + row + 4, *([len(good) - 4] if optimize else [])]  # the last is a frame's
+    for place in places:
+        bad = bytearray(good)
+        bad[place : place + 4] = np.float32(value).tobytes()
+        buffer = fill(make_buffer(optimize_memory_usage=optimize), 4)
+        with pytest.raises(ConfigError, match="is damaged: it holds NaN or infinity"):
+            buffer.read_from(io.BytesIO(bad))
+        assert buffer.task_size.tolist() == [0, 0]
+        assert fill(buffer, 2).task_size.tolist() == [2, 2]
+
+
+def test_a_ring_that_memory_has_no_room_for_leaves_an_empty_buffer(monkeypatch):
+    monkeypatch.setattr(
+        TaskReplayBuffer, "_total_memory", lambda _: 10**30
+    )  # as it would be on a larger machine
+    buffer = fill(make_buffer(), 4)
+    with pytest.raises(ConfigError, match=r"cannot be held .*; this one is now empty"):
+        buffer.read_from(io.BytesIO(with_header(saved(fill(make_buffer(), 3)), buffer_size=10**15)))
+    assert buffer.task_size.tolist() == [0, 0]
+
+
+HOSTILE = (
+    None,
+    True,
+    -1,
+    0,
+    1,
+    3,
+    2**31,
+    10**12,
+    2**63,
+    0.5,
+    "",
+    "A",
+    "\ud800",
+    [],
+    {},
+    [1],
+    [3, 3],
+    ["a"],
+    [[3]],
+)
+
+
+def mutated(content, draw):
+    """A saved buffer with some bits, bytes or parts of its header changed."""
+    start = content.index(b"\n") + 1
+    end = start + 8 + int.from_bytes(content[start : start + 8], "little")
+    at, how = (
+        draw.choice((draw.randrange(len(content)), draw.randrange(end, len(content)))),
+        draw.randrange(8),
+    )
+    if how == 0:
+        return content[:at]
+    if how == 1:
+        return content[:at] + draw.randbytes(draw.choice((1, 8, 300))) + content[at:]
+    if how == 2:
+        return content[:start] + draw.randbytes(8) + content[start + 8 :]
+    if how <= 4:
+        changed = bytearray(content)
+        for _ in range(draw.choice((1, 2, 30))):
+            changed[draw.randrange(end) if how == 3 else draw.randrange(end, len(content))] ^= (
+                1 << draw.randrange(8)
+            )
+        return bytes(changed)
+    if how == 5:  # what read as a number is NaN
+        return content[:at] + b"\xff" * 8 + content[at + 8 :]
+    header = json.loads(content[start + 8 : end])
+    return with_header(content, **{draw.choice([*header]): draw.choice(HOSTILE)})
+
+
+@KINDS
+def test_mutated_files_are_refused_or_read_and_leave_a_whole_buffer(optimize):
+    content = saved(fill(make_buffer(optimize_memory_usage=optimize), 4))
+    refused = emptied = 0
+    for index in range(1000):
+        draw = random.Random(index)
+        buffer = fill(make_buffer(optimize_memory_usage=optimize, seed=1), 3)
+        before = pickle.dumps(buffer)
+        kind = draw.choice((io.BytesIO, Pipe))
+        try:
+            buffer.read_from(kind(mutated(content, draw)))
+        except ConfigError:
+            refused += 1
+            if pickle.dumps(buffer) != before:
+                assert buffer.task_size.tolist() == [0, 0], index
+                emptied += 1
+        except BaseException as error:
+            raise AssertionError(f"file {index}: {type(error).__name__} {error}") from error
+        fill(buffer, 2)
+        assert all(th.isfinite(part).all() for part in buffer.sample(2)[:5]), index
+    assert 600 < refused < 950 and 50 < emptied < 400, (refused, emptied)
 
 
 class Pipe(io.BytesIO):

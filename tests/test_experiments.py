@@ -5,18 +5,20 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch as th
 import yaml
 
-from sb3_ars import ARSSAC
+from sb3_ars import ARSSAC, load_policy
 from sb3_ars.cli import main
 from sb3_ars.errors import ConfigError, WorkerError
 from sb3_ars.experiments import runner
 from sb3_ars.experiments.config import RunConfig, ScheduleConfig, load_config, load_preset, save_config
-from sb3_ars.experiments.run_folder import write_json, write_whole
+from sb3_ars.experiments.run_folder import write_json
 from sb3_ars.experiments.runner import build_model, train
+from sb3_ars.files import write_whole
 
 
 def tiny_toy(**algorithm):
@@ -42,6 +44,7 @@ def test_a_run_leaves_a_complete_folder(algorithm, tmp_path, capsys):
         "versions.json",
         "progress.csv",
         "policy.zip",
+        "policy.safetensors",
         "best_model.zip",
         "evaluations.npz",
         "evaluation.csv",
@@ -58,6 +61,26 @@ def test_a_run_leaves_a_complete_folder(algorithm, tmp_path, capsys):
     for key in ("success", "return", "reward_scale", "mean_reward", "q_value", "ent_coef"):
         assert f"{key}/point-west" in log, key
     assert json.loads((result.folder / "versions.json").read_text())["packages"]["torch"]
+
+
+def test_a_run_leaves_its_policy_as_a_file_to_share(run):
+    policy, model = load_policy(run / "policy.safetensors"), ARSSAC.load(run / "policy.zip")
+    obs = np.random.default_rng(0).uniform(-1, 1, (8, 6))
+    for task in model.task_names:
+        expected, _ = model.predict(obs, deterministic=True, task=task)
+        np.testing.assert_array_equal(policy.predict(obs, deterministic=True, task=task)[0], expected)
+
+
+def test_a_run_whose_policy_cannot_be_shared_is_kept_all_the_same(tmp_path, monkeypatch):
+    def refuse(model, path):
+        raise ConfigError("it cannot be said without code.")
+
+    monkeypatch.setattr(runner, "export_policy", refuse)
+    config = dataclasses.replace(tiny_toy(), output=tmp_path)
+    with pytest.warns(UserWarning, match=r"has no policy\.safetensors: it cannot be said without code\."):
+        result = train(config, "toy", progress_bar=False)
+    files = {path.name for path in result.folder.iterdir()}
+    assert "policy.safetensors" not in files and files >= {"policy.zip", "result.json"}
 
 
 def test_a_second_run_gets_a_folder_of_its_own(tmp_path):

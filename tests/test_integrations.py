@@ -14,7 +14,7 @@ import torch as th
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_ars import ARSSAC, ARSTQC, make_toy_env
+from sb3_ars import ARSSAC, ARSTQC, LoadedPolicy, make_toy_env
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.config import load_preset
 from sb3_ars.integrations.gymnasium_env import TaskSet
@@ -182,12 +182,22 @@ def test_a_run_goes_to_the_hub_and_comes_back(run, hub, monkeypatch):
     names = {}
     exec(block.replace("runs/mt10-ars-seed0", str(run)), names)
     saved = ARSSAC.load(run / "policy.zip")
-    np.testing.assert_array_equal(
-        names["model"].predict(observations(4), deterministic=True)[0],
-        saved.predict(observations(4), deterministic=True)[0],
-    )
+    for loaded, kind in (("policy", LoadedPolicy), ("model", ARSSAC)):
+        assert isinstance(names[loaded], kind)
+        np.testing.assert_array_equal(
+            names[loaded].predict(observations(4), deterministic=True)[0],
+            saved.predict(observations(4), deterministic=True)[0],
+        )
     files = {path.name for path in (hub.folder / "me" / "mt10-ars").iterdir()}
-    assert files >= {"README.md", "policy.zip", "config.yaml", "result.json", "versions.json", "training.png"}
+    assert files >= {
+        "README.md",
+        "policy.safetensors",
+        "policy.zip",
+        "config.yaml",
+        "result.json",
+        "versions.json",
+        "training.png",
+    }
     assert hub.commits == ["Upload a run of sb3_ars"]
     huggingface_sb3 = pytest.importorskip("huggingface_sb3", reason="extra 'zoo' is missing")
     monkeypatch.setenv("TRUST_REMOTE_CODE", "1")
@@ -215,18 +225,26 @@ def test_the_card_says_what_was_measured_and_how_long_it_was_trained(run, hub):
         assert f"| {name} | {task['success']:.1%} |" in text
 
 
-def test_nothing_is_unpickled_without_trust(run, hub, monkeypatch):
+def test_nothing_is_unpickled_without_trust(run, hub, monkeypatch, tmp_path):
     from sb3_ars.integrations.hub import load_from_hub, package_run, push_run
 
     push_run(run, "me/toy")
-    with pytest.raises(ConfigError, match=r"can run any code.*trust=True"):
+    uploaded = hub.folder / "me" / "toy"
+    zipped = (uploaded / "policy.zip").read_bytes()
+    (uploaded / "policy.zip").write_bytes(b"nothing reads this")
+    monkeypatch.setenv("TRUST_REMOTE_CODE", "True")  # huggingface_sb3's; here only the argument counts
+    policy = load_from_hub("me/toy")
+    assert isinstance(policy, LoadedPolicy) and policy.task_names[0] == "point-east"
+    (uploaded / "policy.safetensors").write_bytes(zipped)
+    with pytest.raises(ConfigError, match="it is a zip"):
         load_from_hub("me/toy")
-    monkeypatch.setenv("TRUST_REMOTE_CODE", "True")
-    assert load_from_hub("me/toy").task_names[0] == "point-east"
-    with pytest.raises(ConfigError, match="trust=True"):
-        load_from_hub("me/toy", trust=False)
+    (uploaded / "policy.safetensors").unlink()
+    with pytest.raises(ConfigError, match=r"policy\.safetensors cannot be had.*can run any code.*trust=True"):
+        load_from_hub("me/toy")
+    (uploaded / "policy.zip").write_bytes(zipped)
+    assert load_from_hub("me/toy", trust=True).n_resets == 1
     with pytest.raises(ConfigError, match="me/other cannot be downloaded as a run of sb3_ars"):
-        load_from_hub("me/other")
+        load_from_hub("me/other", trust=True)
     with pytest.raises(ConfigError, match="choose a new folder"):
         package_run(run, run, "me/toy")
 

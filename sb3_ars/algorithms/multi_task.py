@@ -65,6 +65,7 @@ from sb3_ars.nets.lora import LoRAConfig, layers_to_adapt
 from sb3_ars.nets.mlp import set_arithmetic
 from sb3_ars.nets.paco import PaCo
 from sb3_ars.nets.popart import PopArtNetwork, PopArtNormalizer
+from sb3_ars.task_id import task_index, with_task_id
 
 __all__ = ["MultiTaskOffPolicyAlgorithm"]
 
@@ -555,7 +556,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param tasks: names or indices; ``None`` is all
         :raises ConfigError: for an unknown task, none at all, or an environment that can only step as a whole
         """
-        indices = None if tasks is None else sorted({self._task_index(task) for task in tasks})
+        indices = None if tasks is None else sorted({task_index(task, self.task_names) for task in tasks})
         if indices == []:
             raise ConfigError(
                 "set_active_tasks([]) would collect nothing; name at least one task, or None for all."
@@ -590,13 +591,6 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self.active_tasks is None:
             return self.n_envs
         return sum(self.task_of_env.count(task) for task in self.active_tasks)
-
-    def _task_index(self, task: str | int) -> int:
-        names = self.task_names or []
-        index: Any = names.index(task) if task in names else task
-        if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < len(names):
-            raise ConfigError(f"task={task!r} is not one of this model's tasks: {names}.")
-        return int(index)
 
     # ------------------------------------------------------------------ learning
 
@@ -1071,12 +1065,7 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param task: name or index of the task all rows belong to
         :raises ConfigError: if the model has no such task
         """
-        if task is not None:
-            observation = self._with_task(observation, task)
-        elif self._lacks_task_id(observation):
-            raise ConfigError(
-                "The observation lacks the one-hot task id; say which task it is from with task=."
-            )
+        observation = with_task_id(observation, task, self.task_names, self.observation_space)
         if self._plan.execution == "cudagraph" and _same_shape(observation, self._last_obs):
             return self._predict_captured(observation, deterministic), state
         return super().predict(observation, state, episode_start, deterministic)
@@ -1104,21 +1093,6 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         super().set_parameters(load_path_or_dict, exact_match, device)
         self._prepare_execution()  # the optimizers took over options of the machine that saved them
-
-    def _lacks_task_id(self, observation: Any) -> bool:
-        width = self.observation_space.shape
-        return (
-            self.is_multi_task
-            and width is not None
-            and np.shape(observation)[-1:] == (width[0] - self.n_tasks,)
-        )
-
-    def _with_task(self, observation: Any, task: str | int) -> np.ndarray:
-        one_hot = np.eye(self.n_tasks, dtype=np.float32)[self._task_index(task)]
-        observation = np.asarray(observation)
-        return np.concatenate(
-            (observation, np.broadcast_to(one_hot, (*observation.shape[:-1], self.n_tasks))), axis=-1
-        )
 
     @classmethod
     def load(  # type: ignore[override]  # SB3 annotates self-typed class methods per class

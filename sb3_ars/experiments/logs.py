@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import (
 )
 from torch.utils.tensorboard.writer import SummaryWriter
 
-from sb3_ars.experiments.run_folder import write_whole
+from sb3_ars.files import write_whole
 
 __all__ = ["PROGRESS", "continued_logger", "new_logger"]
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ import pandas as pd
 
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.config import RunConfig, load_config
+from sb3_ars.files import write_whole
 
 __all__ = [
     "CHECKPOINTS",
@@ -27,7 +26,6 @@ __all__ = [
     "is_finished",
     "read_run",
     "write_json",
-    "write_whole",
 ]
 
 FORMAT = 1
@@ -143,27 +141,6 @@ def read_run(folder: Path) -> Run:
     _check_result(folder / RESULT, result)
     config = load_config(folder / "config.yaml")
     return Run(folder, result["name"], config, result, _read_json(folder / "versions.json"))
-
-
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file or folder whole or not at all: a reader never meets half of it, and a failure leaves nothing.
-
-    :param path: to write; what is there already is replaced
-    :param write: writes it under the path it is given, a hidden one beside it with the same suffix
-    """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(temporary)
-        if temporary.is_file():
-            with temporary.open("rb") as file:
-                os.fsync(file.fileno())  # else a power cut could leave the name with nothing behind it
-        temporary.replace(path)
-    except BaseException:  # an interrupt too
-        if temporary.is_dir():
-            shutil.rmtree(temporary, ignore_errors=True)
-        else:
-            temporary.unlink(missing_ok=True)
-        raise
 
 
 def write_json(path: Path, value: Any) -> None:

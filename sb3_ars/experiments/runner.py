@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
+import warnings
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +38,7 @@ from sb3_ars.experiments.config import Activation, BodyOptions, RunConfig, load_
 from sb3_ars.experiments.logs import PROGRESS, continued_logger, new_logger
 from sb3_ars.experiments.plots import plot_training
 from sb3_ars.experiments.run_folder import CHECKPOINTS, FORMAT, RESULT, is_finished, read_run, write_json
+from sb3_ars.policy_file import export_policy
 from sb3_ars.profiling import PartTimer
 from sb3_ars.versions import run_versions
 
@@ -45,7 +47,7 @@ __all__ = [
     "build_model",
     "evaluate_run",
     "final_table",
-    "load_policy",
+    "load_model",
     "make_env",
     "method_callbacks",
     "resume",
@@ -163,6 +165,7 @@ def _run(
         seconds = checkpoints.seconds
         by_part = timer.seconds() if timer else None
         model.save(folder / "policy")
+        _export(model, folder)
         evaluations = _evaluate_both(model, evaluation_env, protocol, progress_bar)
         table = final_table(evaluations, model.reward_scale.scale.tolist())
         names = list(evaluations[True].task_names)
@@ -195,7 +198,7 @@ def evaluate_run(
     )
     config = dataclasses.replace(config, evaluation=evaluation)
     chosen = protocol_of(config, own_horizon=protocol is None)
-    model = load_policy(folder / "policy.zip", config)
+    model = load_model(folder / "policy.zip", config)
     started = time.monotonic()
     with closing(_make_evaluation_env(config, chosen)) as env:
         evaluations = _evaluate_both(model, env, chosen, progress_bar)
@@ -204,8 +207,8 @@ def evaluate_run(
     return RunResult(folder, table, chosen.describe(), time.monotonic() - started)
 
 
-def load_policy(path: Path, config: RunConfig, device: str = "auto") -> MultiTaskOffPolicyAlgorithm:
-    """Return the model that a run saved.
+def load_model(path: Path, config: RunConfig, device: str = "auto") -> MultiTaskOffPolicyAlgorithm:
+    """Return the model that a run saved. The file is a pickle's home: load it only from people you trust.
 
     :param path: its ``policy.zip``
     :param config: of the run
@@ -362,6 +365,14 @@ def _learn(
             bar.pbar.close()
     model.dump_logs()  # so that the log's last row is the run's last step
     return interrupted
+
+
+def _export(model: MultiTaskOffPolicyAlgorithm, folder: Path) -> None:
+    """Write the policy as a file to share, where it can be one; the run is finished without it too."""
+    try:
+        export_policy(model, folder / "policy")
+    except ConfigError as error:
+        warnings.warn(f"{folder} has no policy.safetensors: {error}", stacklevel=3)
 
 
 def _remove_if_unused(folder: Path) -> None:

@@ -1,22 +1,23 @@
 """Policies to and from the Hugging Face hub, with a card that says what was measured; needs ``sb3-ars[hub]``.
 
-The zip is SB3's, under the name ``policy.zip``, so ``huggingface_sb3.load_from_hub`` fetches it as well.
+The zip beside the policy's file is SB3's, under the name ``policy.zip``, so ``huggingface_sb3.load_from_hub`` fetches
+it as well.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.catalogue import preset_names
 from sb3_ars.experiments.config import load_config, load_preset
 from sb3_ars.experiments.run_folder import RESULT, Run, read_run
-from sb3_ars.experiments.runner import load_policy
+from sb3_ars.experiments.runner import load_model
+from sb3_ars.policy_file import LoadedPolicy, load_policy
 
 try:
     import huggingface_hub
@@ -27,6 +28,7 @@ except ImportError as error:
 __all__ = ["load_from_hub", "model_card", "package_run", "push_run"]
 
 _FILES = (
+    "policy.safetensors",
     "policy.zip",
     "config.yaml",
     "versions.json",
@@ -83,37 +85,51 @@ def package_run(folder: Path, output: Path, repo_id: str) -> Path:
     return output
 
 
+@overload
 def load_from_hub(
-    repo_id: str,
-    trust: bool | None = None,
-    revision: str | None = None,
-    device: str = "auto",
-) -> MultiTaskOffPolicyAlgorithm:
-    """Download a policy that :func:`push_run` uploaded, and load it.
+    repo_id: str, trust: Literal[False] = ..., revision: str | None = ..., device: str = ...
+) -> LoadedPolicy: ...
 
-    SB3's files hold pickled Python, which can run any code when it is loaded: load only from people you trust.
+
+@overload
+def load_from_hub(
+    repo_id: str, trust: Literal[True], revision: str | None = ..., device: str = ...
+) -> MultiTaskOffPolicyAlgorithm: ...
+
+
+def load_from_hub(
+    repo_id: str, trust: bool = False, revision: str | None = None, device: str = "auto"
+) -> LoadedPolicy | MultiTaskOffPolicyAlgorithm:
+    """Download a policy that :func:`push_run` uploaded, and load it; nothing that was uploaded is executed.
+
+    With ``trust`` it is the model to train on, from SB3's file, which holds pickled Python and can run any code when it
+    is loaded: only for people you trust.
 
     :param repo_id: "user/name"
-    :param trust: that you do; ``None`` asks the environment variable ``TRUST_REMOTE_CODE``, as huggingface_sb3 does
+    :param trust: that you do
     :param revision: commit, tag or branch; a commit cannot be replaced behind your back
     :param device: SB3's
-    :raises ConfigError: without trust, or if the repository holds no run of ours
+    :raises ConfigError: if the repository holds no run of ours, or its policy is damaged
     """
-    if trust is None:
-        trust = os.environ.get("TRUST_REMOTE_CODE", "").lower() in ("1", "true", "yes", "y", "on", "t")
-    if not trust:
-        raise ConfigError(
-            f"Loading {repo_id} would unpickle what somebody uploaded, which can run any code on this machine. If you "
-            "trust its author, pass trust=True or set TRUST_REMOTE_CODE=1; revision=<commit> pins what you looked at."
-        )
+    if trust:
+        config, model = (_download(repo_id, name, revision) for name in ("config.yaml", "policy.zip"))
+        return load_model(model, load_config(config), device)
+    return load_policy(_download(repo_id, "policy.safetensors", revision), device)
+
+
+def _download(repo_id: str, name: str, revision: str | None) -> Path:
     try:
-        config, policy = (
-            Path(huggingface_hub.hf_hub_download(repo_id, name, revision=revision))
-            for name in ("config.yaml", "policy.zip")
-        )
+        return Path(huggingface_hub.hf_hub_download(repo_id, name, revision=revision))
     except (OSError, ValueError) as error:  # the hub's errors are kinds of these
-        raise ConfigError(f"{repo_id} cannot be downloaded as a run of sb3_ars: {error}") from error
-    return load_policy(policy, load_config(config), device)
+        older = (
+            ""
+            if name != "policy.safetensors"
+            else " A run uploaded by another version may have policy.zip alone, which "
+            "can run any code when it is loaded: trust=True loads it, if you trust its author."
+        )
+        raise ConfigError(
+            f"{repo_id} cannot be downloaded as a run of sb3_ars, for {name} cannot be had: {error}.{older}"
+        ) from error
 
 
 def model_card(run: Run, repo_id: str) -> str:
@@ -215,9 +231,10 @@ Trained with python {python}, {versions}. `config.yaml` holds every option, `res
 ```python
 from sb3_ars.integrations.hub import load_from_hub
 
-model = load_from_hub("{repo_id}", trust=True)
+policy = load_from_hub("{repo_id}")  # policy.predict(observation)
 ```
 
-`trust=True`, because Stable-Baselines3's files hold pickled Python, which can run any code when it is loaded: look at
-who uploaded them first.
+This loads `policy.safetensors`, numbers and text that execute nothing. `policy.zip` is the model to train on, which
+`load_from_hub("{repo_id}", trust=True)` loads: it holds pickled Python, as all files of Stable-Baselines3 do, and can
+run any code when it is loaded, so look at who uploaded it first.
 """

@@ -19,7 +19,7 @@ from torch import nn
 
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.errors import ConfigError
-from sb3_ars.experiments.run_folder import write_whole
+from sb3_ars.files import write_whole
 from sb3_ars.nets.mlp import set_arithmetic
 from sb3_ars.nets.moore import MOORE
 

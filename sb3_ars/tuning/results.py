@@ -22,7 +22,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_ars.errors import ConfigError
-from sb3_ars.experiments.run_folder import write_whole
+from sb3_ars.files import write_whole
 from sb3_ars.tuning.liveness import counts, is_dead, why_failed
 from sb3_ars.tuning.study import DEFINITION
 
