@@ -165,7 +165,7 @@ def make_metaworld_env(
     n_goals: int = 50,
     goal_seed: int = 0,
     start_method: str = "spawn",
-    worker_timeout: float = 30.0,
+    worker_timeout: float = 25.0,
     render_mode: str | None = None,
     fast: bool = True,
     render_size: int = 480,

@@ -131,7 +131,7 @@ def make_toy_env(
     reward_scales: Sequence[float] = _SCALES,
     max_episode_steps: int = 50,
     start_method: str = "spawn",
-    worker_timeout: float = 30.0,
+    worker_timeout: float = 25.0,
     tasks: Sequence[str] | None = None,
     render_mode: str | None = None,
     render_size: int = 320,

@@ -53,7 +53,7 @@ class MultiTaskVecEnv(VecEnv):
         seed: int | None = None,
         n_workers: int | str = "auto",
         start_method: str = "spawn",
-        worker_timeout: float = 30.0,
+        worker_timeout: float = 25.0,
     ) -> None:
         self._closed_because: str | None = "it was never completely built"
         per_task = checks.check_count("n_envs_per_task", n_envs_per_task)
@@ -292,7 +292,7 @@ def make_multitask_env(
     max_episode_steps: int | None = None,
     n_workers: int | str = "auto",
     start_method: str = "spawn",
-    worker_timeout: float = 30.0,
+    worker_timeout: float = 25.0,
     task_names: Sequence[str] | None = None,
     task_of_env: Sequence[int] | None = None,
 ) -> VecEnv:

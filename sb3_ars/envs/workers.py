@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import math
 import mmap
@@ -10,6 +11,8 @@ import multiprocessing
 import os
 import pickle
 import signal
+import socket
+import struct
 import sys
 import tempfile
 import time
@@ -25,6 +28,7 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+import psutil
 
 from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
 
@@ -206,11 +210,13 @@ class TaskEnvs:
         self.current = 0
         """Index of the env that was touched last: the one to blame for an exception."""
 
-    def build(self) -> list[EnvFacts]:
+    def build(self, factories: Sequence[EnvFactory] | None = None) -> list[EnvFacts]:
         """Build the envs and return what they are.
 
+        :param factories: one per env, where they were not given at first: a worker hears of them once it runs
         :raises ConfigError: if a factory raises or does not return a ``gymnasium.Env``
         """
+        self._factories = self._factories if factories is None else factories
         facts = []
         for index, factory in enumerate(self._factories):
             self.current = index
@@ -413,7 +419,7 @@ class WorkerPool:
         tasks: Sequence[str],
         n_workers: int,
         start_method: StartMethod = "spawn",
-        timeout: float = 30.0,
+        timeout: float = 25.0,
     ) -> None:
         self._tasks = list(tasks)
         self._timeout = timeout
@@ -425,11 +431,12 @@ class WorkerPool:
         self._replies: dict[int, bytes] = {}
         self._processes: list[BaseProcess] = []
         self._lines: list[_Line] = []
-        pickled = _pickle_factories(factories, tasks)
+        self._factories = _pickle_factories(factories, tasks)
+        self._owner = os.getpid()
         # Both a finalizer (the pool was dropped) and an exit handler (the script ended).
-        self._end = weakref.finalize(self, _end_workers, self._processes, self._lines, os.getpid())
+        self._end = weakref.finalize(self, _end_workers, self._processes, self._lines, self._owner)
         try:
-            self._start(pickled, start_method)
+            self._start(start_method)
         except BaseException:
             self.close()
             raise
@@ -439,8 +446,9 @@ class WorkerPool:
 
         :raises ConfigError: as `TaskEnvs.build`; its cause holds the worker's traceback
         """
-        self._send_all([("build", ())] * len(self._chunks))
-        self._collect(max(START_TIMEOUT, self._timeout), "building its envs")
+        patience = max(START_TIMEOUT, self._timeout)
+        self._send_all([("build", (self._factories[c.start : c.stop],)) for c in self._chunks], patience)
+        self._collect(patience, "building its envs")
         return self._take_lists()
 
     def allocate(self, layout: StepLayout) -> None:
@@ -448,10 +456,7 @@ class WorkerPool:
         # Not a multiprocessing.RawArray: that can be given to a process only when it starts, and the sizes
         # are known only once the envs are built there. The file loses its name at once, so that nothing is
         # left over.
-        shm = "/dev/shm"
-        folder = shm if os.access(shm, os.W_OK) else None
-        with tempfile.NamedTemporaryFile(prefix="sb3_ars_", dir=folder) as file:
-            file.truncate(layout.offsets()[-1])
+        with _shared_file(layout.offsets()[-1]) as file:
             self.arrays = StepArrays(layout, mmap.mmap(file.fileno(), layout.offsets()[-1]))
             self.activate(np.ones(layout.n_envs, bool))
             self._command(
@@ -486,7 +491,7 @@ class WorkerPool:
         ended: list[Ended] = []
         for worker, reply in sorted(self._replies.items()):
             start = self._chunks[worker].start
-            ended += [end._replace(env=end.env + start) for end in pickle.loads(reply[1:])]
+            ended += [end._replace(env=end.env + start) for end in self._loads(worker, reply)]
         self._replies.clear()
         return ended
 
@@ -507,7 +512,7 @@ class WorkerPool:
         for worker, chosen in wanted.items():
             if replies[worker][:1] == _ERROR:
                 self._raise_original(replies[worker])
-            answers.update(zip(chosen, pickle.loads(replies[worker][1:]), strict=True))
+            answers.update(zip(chosen, self._loads(worker, replies[worker]), strict=True))
         return [answers[index] for index in indices]
 
     def close(self) -> None:
@@ -519,55 +524,73 @@ class WorkerPool:
         """Return the process ids of the workers that have not been ended."""
         return [process.pid for process in self._processes if process.pid is not None]
 
-    def _start(self, factories: Sequence[EnvFactory], start_method: StartMethod) -> None:
+    def _start(self, start_method: StartMethod) -> None:
         context: Any = multiprocessing.get_context(start_method)
         with _hidden_main(), _single_threaded():
-            for number, chunk in enumerate(self._chunks):
-                ours, theirs = context.Pipe()
-                line = _Line(ours, context.Semaphore(0), context.Semaphore(0), context.RawArray("B", 2))
-                # A forked child holds copies of the pipes before it and would keep them open after the parent
-                # died.
-                stale = [line.conn for line in self._lines] + [ours] if start_method == "fork" else []
-                self._lines.append(line)
-                envs = TaskEnvs(factories[chunk.start : chunk.stop], self._tasks[chunk.start : chunk.stop])
-                process = context.Process(
-                    target=_work,
-                    args=(replace(line, conn=theirs), stale, envs),
-                    name=f"sb3_ars-envs-{number}",
-                    daemon=True,
-                )
-                process.start()
-                self._processes.append(process)
-                # Else a dead worker's pipe would never reach its end here.
-                theirs.close()
+            for worker in range(len(self._chunks)):
+                try:
+                    self._start_one(worker, context)
+                except (OSError, EOFError) as error:
+                    raise ConfigError(
+                        f"{self._name(worker)} could not be started ({error or type(error).__name__}). {_remedy(error)}"
+                    ) from error
+
+    def _start_one(self, worker: int, context: Any) -> None:
+        chunk = self._chunks[worker]
+        ours, theirs = context.Pipe()
+        line = _Line(ours, context.Semaphore(0), context.Semaphore(0), context.RawArray("B", 2))
+        # A forked child holds copies of the pipes before it and would keep them open after the parent died.
+        stale = [line.conn for line in self._lines] + [ours] if context.get_start_method() == "fork" else []
+        self._lines.append(line)
+        # The factories follow through our own pipe: a child that dies before it has read what it is started
+        # with would let multiprocessing wait for ever, once that is longer than a pipe holds.
+        envs = TaskEnvs((), self._tasks[chunk.start : chunk.stop])
+        process = context.Process(
+            target=_work,
+            args=(replace(line, conn=theirs), stale, envs),
+            name=f"sb3_ars-envs-{worker}",
+            daemon=True,
+        )
+        process.start()
+        self._processes.append(process)
+        # Else a dead worker's pipe would never reach its end here.
+        theirs.close()
 
     def _command(self, messages: Sequence[tuple[str, tuple[Any, ...]]], doing: str) -> None:
         self._send_all(messages)
         self._collect(self._timeout, doing)
 
-    def _send_all(self, messages: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
+    def _send_all(
+        self, messages: Sequence[tuple[str, tuple[Any, ...]]], patience: float | None = None
+    ) -> None:
         self._settle()
         for worker, message in enumerate(messages):
-            self._send(worker, message)
+            self._send(worker, message, patience)
 
     def _settle(self) -> None:
         """Throw away answers of a command that was interrupted (Ctrl-C) between sending and receiving."""
+        self._check_owner()
         if self._awaiting:
             self._collect(self._timeout, "finishing an interrupted command", fatal=False)
         self._replies.clear()
 
-    def _send(self, worker: int, message: tuple[str, tuple[Any, ...]]) -> None:
+    def _send(self, worker: int, message: tuple[str, tuple[Any, ...]], patience: float | None = None) -> None:
         line, data = self._lines[worker], _dumps(message)
         # In this order, because a long message is taken only while it is read.
         line.ask(_COMMAND)
+        self._awaiting.add(worker)
+        seconds = self._timeout if patience is None else patience
         try:
+            _limit_waiting(line.conn, seconds)
             line.conn.send_bytes(data)
+        except BlockingIOError:
+            self._fail_hung(seconds, f"being sent {message[0]!r}", [worker])
         except OSError:
             self._fail_dead(worker, "before it could be asked")
-        self._awaiting.add(worker)
 
     def _collect(self, timeout: float, doing: str, fatal: bool = True) -> None:
-        deadline = time.monotonic() + timeout
+        self._check_owner()
+        begin = time.monotonic()
         while self._awaiting:
             first, *others = sorted(self._awaiting)
             if self._lines[first].done.acquire(timeout=_LOOK_AROUND):
@@ -579,8 +602,22 @@ class WorkerPool:
                     self._receive(worker, doing, fatal)
                 elif worker in dead:
                     self._fail_dead(worker, f"while {doing}")
-            if self._awaiting and time.monotonic() > deadline:
-                self._fail_hung(timeout, doing)
+            waited = time.monotonic() - begin
+            # building may take longer than a step, but not while the process is stopped
+            if self._awaiting and (waited > timeout or (waited > self._timeout and self._stopped())):
+                self._fail_hung(min(waited, timeout), doing)
+
+    def _stopped(self) -> list[int]:
+        """Return which of the awaited workers a signal has stopped, so that they cannot answer."""
+        return [worker for worker in sorted(self._awaiting) if _is_stopped(self._processes[worker])]
+
+    def _check_owner(self) -> None:
+        if os.getpid() != self._owner:
+            tasks = ", ".join(map(repr, dict.fromkeys(self._tasks)))
+            raise WorkerError(
+                f"The env workers of {tasks} belong to process {self._owner}, of which this one is a fork: they cannot "
+                "serve two. Build the env anew in this process."
+            )
 
     def _receive(self, worker: int, doing: str, fatal: bool) -> None:
         line = self._lines[worker]
@@ -589,6 +626,8 @@ class WorkerPool:
                 if not line.conn.poll(self._timeout):  # stopped between its wake-up and its message
                     self._fail_hung(self._timeout, doing)
                 self._replies[worker] = line.conn.recv_bytes()
+            except BlockingIOError:  # stopped in the middle of its message
+                self._fail_hung(self._timeout, doing)
             except (EOFError, OSError):
                 self._fail_dead(worker, f"while {doing}")
         self._awaiting.discard(worker)
@@ -596,8 +635,17 @@ class WorkerPool:
             self._fail_raised(self._replies[worker], doing)
 
     def _take_lists(self) -> list[Any]:
-        parts = [pickle.loads(self._replies.pop(worker)[1:]) for worker in range(len(self._chunks))]
+        parts = [self._loads(worker, self._replies.pop(worker)) for worker in range(len(self._chunks))]
         return [item for part in parts for item in part]
+
+    def _loads(self, worker: int, reply: bytes) -> Any:
+        try:
+            return pickle.loads(reply[1:])
+        except Exception as error:
+            self._fail(
+                f"{self._name(worker)} sent an info or an answer that cannot be read outside its process "
+                f"({type(error).__name__}: {error}). Use plain numbers, strings and arrays in it, or n_workers=0."
+            )
 
     def _name(self, worker: int) -> str:
         chunk = self._chunks[worker]
@@ -620,12 +668,16 @@ class WorkerPool:
             f"{self._name(worker)} {how} {when}.{hint} Its last words, if any, are on the error output."
         )
 
-    def _fail_hung(self, timeout: float, doing: str) -> NoReturn:
-        names = "; ".join(self._name(worker) for worker in sorted(self._awaiting))
-        self._fail(
-            f"{names} did not answer within {timeout:g} s while {doing}. "
-            "If the env is only slow, raise worker_timeout; if it hangs, try n_workers=0 to see where."
+    def _fail_hung(self, timeout: float, doing: str, workers: Sequence[int] | None = None) -> NoReturn:
+        hung = sorted(self._awaiting) if workers is None else workers
+        names = "; ".join(self._name(worker) for worker in hung)
+        stopped = any(_is_stopped(self._processes[worker]) for worker in hung)
+        why = (
+            "A signal has stopped it (SIGSTOP, or Ctrl-Z in its terminal)."
+            if stopped
+            else "If the env is only slow, raise worker_timeout; if it hangs, try n_workers=0 to see where."
         )
+        self._fail(f"{names} did not answer within {timeout:g} s while {doing}. {why}")
 
     def _fail_raised(self, reply: bytes, doing: str) -> NoReturn:
         task, trace, error = _read_error(reply)
@@ -801,18 +853,50 @@ def _next_question(line: _Line) -> int:
 
 def _answer(envs: TaskEnvs, message: bytes | None) -> bytes:
     """Return what is to be told beyond the arrays, nothing after most steps; a step has no message."""
+    # BaseException: an env that calls sys.exit() would end the worker with status 0 and without a word.
     try:
         if message is None:
             ended = envs.step_wait()
-            return _RESULT + _dumps(ended) if ended else b""
+            return _pack(envs, "step", ended) if ended else b""
         method, args = pickle.loads(message)
-        return _RESULT + _dumps(getattr(envs, method)(*args))
-    except Exception as error:
+        return _pack(envs, method, getattr(envs, method)(*args))
+    except BaseException as error:
         return _ERROR + _dumps((envs.blame(), traceback.format_exc(), _portable(error)))
 
 
-def _portable(error: Exception) -> bytes | None:
-    """Return the exception pickled, or None if it does not survive the journey."""
+def _pack(envs: TaskEnvs, method: str, answer: Any) -> bytes:
+    """Return an answer as bytes.
+
+    :raises EnvContractError: naming the task and the entry, for an info that cannot be pickled
+    """
+    try:
+        return _RESULT + _dumps(answer)
+    except Exception as error:
+        for index, item in enumerate(answer if method in ("step", "reset") else ()):
+            envs.current, infos = (item.env, item[1:]) if isinstance(item, Ended) else (index, (item,))
+            entries = [(key, value) for info in infos for key, value in info.items()]
+            for key, value in entries:
+                if _is_portable(value):
+                    continue
+                raise EnvContractError(
+                    f"Task {envs.blame()!r}: info[{key!r}] of its {method}() is of type {type(value).__name__}, which "
+                    f"cannot be sent from a worker process ({error}). Leave it out of the info, or use n_workers=0."
+                ) from error
+        raise
+
+
+def _is_portable(value: Any) -> bool:
+    try:
+        _dumps(value)
+    except Exception:
+        return False
+    return True
+
+
+def _portable(error: BaseException) -> bytes | None:
+    """Return the exception pickled; None if it does not survive the journey, or would end the process it arrives in."""
+    if not isinstance(error, Exception):
+        return None
     try:
         data = _dumps(error)
         pickle.loads(data)
@@ -829,21 +913,95 @@ def _read_error(reply: bytes) -> tuple[str, str, Exception | None]:
         return task, trace, None
 
 
+def _shared_file(size: int) -> Any:
+    """Return an open file of zeros that processes can map by its name: in memory where there is room, else on disk.
+
+    :param size: bytes
+    :raises ConfigError: if there is room nowhere
+    """
+    said: list[OSError] = []
+    for folder in ("/dev/shm", None):
+        try:
+            file = tempfile.NamedTemporaryFile(prefix="sb3_ars_", dir=folder)  # the caller closes it
+        except OSError as error:
+            said.append(error)
+            continue
+        # Written, not only made as long: whoever touches a mapped page that finds no room is killed by SIGBUS.
+        try:
+            file.write(bytes(size))
+            file.flush()
+            return file
+        except OSError as error:
+            said.append(error)
+            with contextlib.suppress(OSError):  # it tries to write once more
+                file.close()
+    raise ConfigError(
+        f"The {size:,} bytes that workers share find room neither in /dev/shm ({said[0]}) nor in the folder for "
+        f"temporary files ({said[1]}). {_remedy(said[0])}"
+    ) from said[0]
+
+
+def _remedy(error: OSError | EOFError) -> str:
+    """Return what to do about an error of the system while workers start."""
+    code = getattr(error, "errno", None)
+    if code in (errno.EMFILE, errno.ENFILE):
+        return "Let this process open more files (ulimit -n), or use fewer workers (n_workers)."
+    if code in (errno.EAGAIN, errno.ENOMEM):
+        return (
+            "The limit on processes (ulimit -u, a container's --pids-limit) or the memory is used up: raise it, or "
+            "use fewer workers (n_workers)."
+        )
+    if code in (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM):
+        return (
+            "Processes meet through /dev/shm, which must be writable and have room: start a container with "
+            "--shm-size=256m, or use n_workers=0."
+        )
+    return "Use n_workers=0 to step the envs in this process."
+
+
+def _limit_waiting(conn: Connection, seconds: float) -> None:
+    """Let a message to or from a process that is stopped in the middle of it fail with BlockingIOError.
+
+    A Connection has no timeout of its own, but its socket has.
+    """
+    span = struct.pack("@ll", int(seconds), int(seconds % 1 * 1e6))
+    end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM, fileno=os.dup(conn.fileno()))
+    with end:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, span)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, span)
+    os.set_blocking(conn.fileno(), True)  # the wrapper may have changed it: socket.setdefaulttimeout()
+
+
+def _is_stopped(process: BaseProcess) -> bool:
+    try:
+        return bool(psutil.Process(process.pid).status() == psutil.STATUS_STOPPED)
+    except psutil.Error:
+        return False
+
+
 def _end_workers(processes: list[BaseProcess], lines: list[_Line], owner: int, grace: float = 3.0) -> None:
     if os.getpid() != owner:  # a forked copy of the parent must not end the parent's workers
         return
     for line in lines:
         line.ask(_CLOSE)
         line.conn.close()
+    for process in processes:  # a stopped one can neither close its envs nor be terminated
+        _wake(process)
     _join(processes, grace)
     for process in processes:
         process.terminate()
+        _wake(process)
     _join(processes, 1.0)
     for process in processes:
         process.kill()
     _join(processes, 1.0)
     processes.clear()
     lines.clear()
+
+
+def _wake(process: BaseProcess) -> None:
+    if process.pid is not None and _is_stopped(process):
+        os.kill(process.pid, signal.SIGCONT)
 
 
 def _join(processes: Sequence[BaseProcess], seconds: float) -> None:
