@@ -22,10 +22,12 @@ import cloudpickle
 import numpy as np
 import psutil
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ars import ARSSAC
-from sb3_ars.envs import MultiTaskVecEnv, make_toy_env, workers
+from sb3_ars.envs import MultiTaskVecEnv, make_multitask_env, make_toy_env, workers
 from sb3_ars.envs.toy import PointTask
 from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
 
@@ -180,6 +182,23 @@ def test_a_fault_in_the_middle_of_training_is_reported_with_its_task_and_leaves_
         env = build(how, worker_timeout=0.5)
         with pytest.raises(error, match=message):
             train(env)
+
+
+def test_training_goes_on_with_another_env_after_a_fault():
+    with reported_in_time():
+        env = build("kill", at=50)
+        model = ARSSAC(
+            "MlpPolicy", env, batch_size=4, learning_starts=20, n_reset=0, policy_kwargs={"net_arch": [8]}
+        )
+        with pytest.raises(WorkerError):
+            model.learn(200)
+        reached = model.num_timesteps
+        assert reached == 98 and model.replay_buffer.task_size.tolist() == [49, 49]
+        other = build()
+        model.set_env(other)
+        model.learn(200, reset_num_timesteps=False)
+        other.close()
+    assert model.num_timesteps == reached + 200 and model.replay_buffer.task_size.tolist() == [149, 149]
 
 
 @pytest.mark.parametrize("how", REPORTED)
@@ -485,4 +504,269 @@ def test_a_fork_of_the_parent_is_refused_and_harms_nobody():
 def test_the_default_timeout_reports_a_hang_within_half_a_minute():
     env = make_toy_env(n_workers=1)
     assert env._runner._timeout + 2 * workers._LOOK_AROUND + 3 < TOO_LONG
+    env.close()
+
+
+# ---------------------------------------------------------------------- restart_workers
+
+
+class Marked(Faulty):
+    """Fails in the first process it is built in alone, and knows its seed."""
+
+    def __init__(self, how="", at=10**9, where="step", mark=None):
+        # a file, for it must outlive the process: only the first env that is built fails
+        self.mark = mark
+        is_first = mark is None or not Path(mark).exists()
+        if mark is not None:
+            Path(mark).touch()
+        super().__init__(how if is_first else "", where, at)
+        self.max_episode_steps = 50
+
+    def reset(self, *, seed=None, options=None):
+        self.given_seed = seed if seed is not None else getattr(self, "given_seed", -1)
+        return super().reset(seed=seed)
+
+
+def restarting(how, tmp_path, at=20, n_envs_per_task=1, where="step", once=True, **options):
+    """Three tasks in two workers; the one of the second worker's two that is called wild fails, once."""
+    mark = str(tmp_path / "built") if once else None
+    tasks = {
+        "calm": [Marked] * n_envs_per_task,
+        "near": [Marked] * n_envs_per_task,
+        "wild": [partial(Marked, how, at, where, mark=mark), *[Marked] * (n_envs_per_task - 1)],
+    }
+    options = {"n_workers": 2, "seed": 0, "worker_timeout": 0.5, "restart_workers": True, **options}
+    return MultiTaskVecEnv(tasks, n_envs_per_task=n_envs_per_task, **options)
+
+
+LOST = {
+    "raise": r"env of task 'wild' raised \"KeyError: 'the gripper fell off'\" while stepping",
+    "exit": "exited with 7 while stepping",
+    "sys.exit": "env of task 'wild' raised 'SystemExit: 0' while stepping",
+    "kill": "was killed by SIGKILL while stepping",
+    "stop": r"did not answer within 0.5 s while stepping.*A signal has stopped it",
+    "hang": "did not answer within 0.5 s while stepping",
+}
+
+
+@pytest.mark.parametrize("how", LOST)
+def test_a_lost_worker_is_started_anew_and_its_episodes_end_as_truncated(how, tmp_path):
+    actions = np.random.default_rng(1).uniform(-1, 1, (30, 3, 2)).astype(np.float32)
+    undisturbed = restarting("", tmp_path, n_workers=0, restart_workers=False)
+    with reported_in_time():
+        (tmp_path / "built").unlink()
+        env = restarting(how, tmp_path, at=20)
+        assert env._runner._worker_of == [0, 1, 1]
+        last, expected = env.reset(), undisturbed.reset()
+        np.testing.assert_array_equal(last, expected)
+        returns, pids = np.zeros(3), env._runner.pids
+        for step in range(30):
+            fails = step == 19
+            with pytest.warns(UserWarning, match=LOST[how]) if fails else contextlib.nullcontext() as caught:
+                obs, rewards, dones, infos = env.step(actions[step])
+            expected, *others = undisturbed.step(actions[step])
+            # the other worker's env notices nothing
+            np.testing.assert_array_equal(obs[0], expected[0])
+            assert (rewards[0], dones[0], infos[0]) == (others[0][0], others[1][0], others[2][0])
+            if step < 19:
+                np.testing.assert_array_equal(obs, expected)
+                returns += rewards
+            if not fails:
+                assert not dones.any() and not any("worker_restarted" in info for info in infos)
+                last = obs
+                continue
+            assert "(tasks 'near', 'wild') were built anew, restart 1 of this worker" in str(
+                caught[0].message
+            )
+            assert dones.tolist() == [False, True, True] and rewards[1:].tolist() == [0.0, 0.0]
+            for row in (1, 2):
+                np.testing.assert_array_equal(infos[row].pop("terminal_observation"), last[row])
+                episode = infos[row].pop("episode")
+                assert episode["l"] == 19 and episode["r"] == pytest.approx(returns[row], rel=1e-6)
+                assert infos[row] == {"worker_restarted": True, "TimeLimit.truncated": True}
+            assert env._runner.pids[0] == pids[0] and env._runner.pids[1] != pids[1]
+            seeds = [int(np.random.SeedSequence([seed, 1]).generate_state(1)[0]) for seed in (1, 2)]
+            assert env.get_attr("given_seed") == [0, *seeds]
+            for row, seed in zip((1, 2), seeds, strict=True):
+                np.testing.assert_array_equal(obs[row, :6], Marked().reset(seed=seed)[0])
+        env.close()
+
+
+@pytest.mark.parametrize("how", ["raise", "kill", "hang"])
+def test_a_worker_lost_in_a_reset_is_started_anew_and_reset(how, tmp_path):
+    with reported_in_time():
+        env = restarting(how, tmp_path, at=1, where="reset")
+        with pytest.warns(
+            UserWarning, match=r"'wild'.* while resetting its envs[\s\S]*restart 1 of this worker"
+        ):
+            first = env.reset()
+        seed = int(np.random.SeedSequence([2, 1]).generate_state(1)[0])
+        np.testing.assert_array_equal(first[2, :6], Marked().reset(seed=seed)[0])
+        np.testing.assert_array_equal(first[0, :6], Marked().reset(seed=0)[0])
+        assert not env.step(np.zeros((3, 2), np.float32))[2].any()
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("how", "where", "at"),
+    [("kill", "step", 1), ("raise", "step", 1), ("raise", "build", 2), ("kill", "build", 2)],
+)
+@pytest.mark.filterwarnings("ignore:[\\s\\S]*were built anew")
+def test_a_worker_that_fails_again_and_again_is_given_up(how, where, at, tmp_path):
+    class Builds(Marked):
+        """Counts across processes how often it was built."""
+
+        def _meet(self, met):
+            if met == "build" and self.mark is not None:
+                with open(self.mark + "s", "a") as file:
+                    file.write("x")
+                if where == "build" and len(Path(self.mark + "s").read_text()) >= at:
+                    fail(how)
+            return super()._meet(met)
+
+    with reported_in_time():
+        trouble = ("kill", 1) if where == "build" else (how, at)
+        tasks = {"calm": Marked, "wild": partial(Builds, *trouble, mark=str(tmp_path / "built"))}
+        if where == "step":
+            tasks["wild"] = partial(Faulty, how, "step", at)
+        env = MultiTaskVecEnv(tasks, n_workers=2, restart_workers=True, seed=0)
+        env.reset()
+        with pytest.raises(
+            WorkerError, match=r"'wild'[\s\S]* started anew 3 times in a row, and no step worked"
+        ):
+            for _ in range(5):
+                env.step(IDLE)
+    if where == "build":
+        assert (tmp_path / "builts").read_text() == "x" * 4
+
+
+def test_restarts_that_are_not_in_a_row_are_not_limited(tmp_path):
+    with reported_in_time():
+        env = MultiTaskVecEnv(
+            {"calm": Marked, "wild": partial(Faulty, "raise", at=3)},
+            n_workers=2,
+            restart_workers=True,
+            seed=0,
+        )
+        env.reset()
+        ended = []
+        with pytest.warns(UserWarning) as caught:
+            for _ in range(15):
+                ended.append(bool(env.step(IDLE)[2][1]))
+        assert ended == [False, False, True] * 5
+        assert [str(w.message).count(f"restart {n} of") for n, w in enumerate(caught, 1)] == [1] * 5
+        env.close()
+
+
+def test_nan_from_an_env_ends_the_run_even_where_workers_are_restarted(tmp_path):
+    with reported_in_time():
+        env = restarting("nan", tmp_path)
+        env.reset()
+        with pytest.raises(EnvContractError, match=r"Task 'wild'.*NaN or infinity"):
+            for _ in range(20):
+                env.step(np.zeros((3, 2), np.float32))
+
+
+def test_a_restart_touches_inactive_tasks_of_the_same_worker_only(tmp_path):
+    with reported_in_time():
+        env = restarting("kill", tmp_path, at=3, n_envs_per_task=2)
+        assert env._runner._worker_of == [0, 0, 0, 1, 1, 1]
+        env.reset()
+        env.set_active_tasks([2])
+        for _ in range(2):
+            env.step(np.zeros((6, 2), np.float32))
+        with pytest.warns(UserWarning, match=r"tasks 'near', 'wild'"):
+            *_, dones, infos = env.step(np.zeros((6, 2), np.float32))
+        # the waiting episode of the lost env of task 'near' is gone as well, and so is reported
+        assert dones.tolist() == [False] * 3 + [True] * 3
+        assert [info.get("episode", {}).get("l") for info in infos[3:]] == [0, 2, 2]
+        assert not env.step(np.zeros((6, 2), np.float32))[2].any()
+        env.close()
+
+
+@pytest.mark.parametrize("optimize_memory_usage", [False, True])
+@pytest.mark.parametrize("overlap", [False, True])
+def test_a_run_goes_on_and_its_buffer_holds_no_invented_transition(tmp_path, overlap, optimize_memory_usage):
+    """Each stored transition is one that the toy task's own arithmetic gives."""
+    with reported_in_time():
+        env = restarting("kill", tmp_path, at=30, n_envs_per_task=2)
+        options = {"overlap": overlap, "optimize_memory_usage": optimize_memory_usage, "gradient_steps": 1}
+        with pytest.warns(UserWarning, match="restart 1 of this worker"):
+            model = ARSSAC(
+                "MlpPolicy", env, batch_size=4, learning_starts=48, n_reset=0, seed=0, policy_kwargs={"net_arch": [8]},
+                **options,
+            ).learn(480)  # fmt: skip
+        env.close()
+    buffer = model.replay_buffer
+    assert model.num_timesteps == 480
+    # 80 steps of two envs each; of near's, the second is in the lost worker, of wild's both are
+    assert buffer.task_size.tolist() == [160, 159, 158]
+    for task in range(3):
+        slots = np.tile(np.arange(buffer.task_size[task]), (3, 1))
+        rows = buffer.gather(th.from_numpy(slots))
+        start = task * slots.shape[1]
+        part = slice(start, start + slots.shape[1])
+        columns = (rows.observations, rows.actions, rows.next_observations, rows.rewards, rows.dones)
+        for obs, action, following, reward, done in zip(*(c[part].numpy() for c in columns), strict=True):
+            toy = PointTask()
+            toy.reset(seed=0)
+            toy._state = tuple(obs[:6].tolist())
+            expected, expected_reward, *_ = toy.step(action)
+            np.testing.assert_allclose(following[:6], expected, atol=1e-6)
+            assert reward[0] == pytest.approx(expected_reward, abs=1e-6) and done[0] == 0.0
+    # an episode that broke off counts in no task's averages
+    assert len(model.task_episodes[0]) == 2
+    assert all(episode["return"] > 0 for episodes in model.task_episodes for episode in episodes)
+
+
+def test_the_buffer_leaves_out_a_joint_step_of_which_nothing_is_known(tmp_path):
+    with reported_in_time():
+        env = restarting("kill", tmp_path, at=30, n_workers=1)
+        with pytest.warns(UserWarning, match="restart 1 of this worker"):
+            model = train(env, steps=150)
+        env.close()
+    assert model.replay_buffer.task_size.tolist() == [49] * 3
+
+
+def test_evaluation_does_not_count_an_episode_that_broke_off(tmp_path):
+    from sb3_ars.evaluation import evaluate_tasks
+
+    with reported_in_time():
+        model = train(restarting("", tmp_path, n_workers=0, restart_workers=False), steps=60)
+        (tmp_path / "built").unlink()
+        env = restarting("kill", tmp_path, at=30)
+        with (
+            pytest.warns(UserWarning, match="restart 1"),
+            pytest.raises(WorkerError, match=r"task '\w+' was built anew in the middle of the evaluation"),
+        ):
+            evaluate_tasks(model, env, "env")
+        env.close()
+
+
+def test_restarting_is_refused_where_there_is_no_worker():
+    with pytest.raises(
+        ConfigError, match=r"restart_workers=True with n_workers=0: .*Give n_workers=1 or more"
+    ):
+        make_toy_env(restart_workers=True)
+    with pytest.raises(ConfigError, match="restart_workers='yes' must be True or False"):
+        make_toy_env(restart_workers="yes")
+    with pytest.raises(
+        ConfigError, match="restart_workers=True cannot change a DummyVecEnv that is already built"
+    ):
+        make_multitask_env(DummyVecEnv([PointTask]), restart_workers=True)
+
+
+def test_automatic_workers_are_at_least_one_where_they_are_to_be_restarted():
+    env = make_toy_env(n_workers="auto", restart_workers=True, tasks=["point-west"])
+    assert len(env._runner.pids) == 1
+    env.close()
+
+
+def test_a_preset_s_run_restarts_its_workers_where_that_is_asked_for():
+    from sb3_ars.experiments.config import load_preset, with_options
+    from sb3_ars.experiments.runner import make_env
+
+    config = with_options(load_preset("toy"), {"env": {"n_workers": 1, "restart_workers": True}}, "test")
+    env = make_env(config)
+    assert env._runner._restarts is not None
     env.close()

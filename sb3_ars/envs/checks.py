@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ __all__ = [
     "check_equal_spaces",
     "check_n_workers",
     "check_raw_rewards",
+    "check_restart_workers",
     "check_seed",
     "check_start_method",
     "check_task_names",
@@ -113,6 +115,32 @@ def check_n_workers(value: object, n_envs: int) -> int:
             f"n_workers={value}: this process is daemonic and may not start others. Use n_workers=0."
         )
     return int(value)
+
+
+def check_restart_workers(value: object, n_workers: object, processes: int) -> tuple[bool, int]:
+    """Return whether workers are started anew, and how many there are: "auto" then is one at least.
+
+    :param value: of the option
+    :param n_workers: what was asked for
+    :param processes: what `check_n_workers` made of it
+    :raises ConfigError: if there are no workers, or no way to give a late one the arrays
+    """
+    if not isinstance(value, bool):
+        raise ConfigError(f"restart_workers={value!r} must be True or False.")
+    if not value:
+        return False, processes
+    if not sys.platform.startswith("linux"):
+        raise ConfigError(
+            "restart_workers=True needs Linux, whose /proc gives a new worker the shared arrays."
+        )
+    if n_workers == "auto" and not multiprocessing.current_process().daemon:
+        processes = max(processes, 1)
+    if not processes:
+        raise ConfigError(
+            f"restart_workers=True with n_workers={n_workers!r}: the envs are stepped in this process, which cannot be "
+            "started anew. Give n_workers=1 or more, or leave restart_workers out."
+        )
+    return True, processes
 
 
 def pairs_of_tasks(

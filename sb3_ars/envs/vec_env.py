@@ -42,6 +42,10 @@ class MultiTaskVecEnv(VecEnv):
     :param n_workers: worker processes; 0 steps the envs here, "auto" uses the available CPUs
     :param start_method: "spawn", "fork" or "forkserver"; any works without ``if __name__ == "__main__"``
     :param worker_timeout: seconds a worker may take to answer before it counts as hung
+    :param restart_workers: whether a worker that dies, hangs or whose env raises in a step or a reset is started anew,
+        with a warning, three times in a row at most: its envs are built again, with seeds that follow from theirs, and
+        their episodes end as truncated, with ``worker_restarted`` in the info of that step, which has no outcome. Needs
+        workers and Linux
     :raises ConfigError: if an option or a task cannot work; the message names it
     """
 
@@ -54,6 +58,7 @@ class MultiTaskVecEnv(VecEnv):
         n_workers: int | str = "auto",
         start_method: str = "spawn",
         worker_timeout: float = 25.0,
+        restart_workers: bool = False,
     ) -> None:
         self._closed_because: str | None = "it was never completely built"
         per_task = checks.check_count("n_envs_per_task", n_envs_per_task)
@@ -68,6 +73,7 @@ class MultiTaskVecEnv(VecEnv):
         """How many stored goals each task has, where the tasks are Meta-World's."""
         n_envs = len(factories)
         processes = checks.check_n_workers(n_workers, n_envs)
+        restart, processes = checks.check_restart_workers(restart_workers, n_workers, processes)
         method: Any = checks.check_start_method(start_method)
         timeout = checks.check_timeout(worker_timeout)
         checks.check_seed(seed)
@@ -76,7 +82,7 @@ class MultiTaskVecEnv(VecEnv):
         self._stepping = False
         names = [self.task_names[task] for task in self.task_of_env]
         self._runner: EnvRunner = (
-            WorkerPool(factories, names, processes, method, timeout)
+            WorkerPool(factories, names, processes, method, timeout, restart)
             if processes
             else TaskEnvs(factories, names)
         )
@@ -293,6 +299,7 @@ def make_multitask_env(
     n_workers: int | str = "auto",
     start_method: str = "spawn",
     worker_timeout: float = 25.0,
+    restart_workers: bool = False,
     task_names: Sequence[str] | None = None,
     task_of_env: Sequence[int] | None = None,
 ) -> VecEnv:
@@ -307,6 +314,7 @@ def make_multitask_env(
     :param n_workers: see `MultiTaskVecEnv`; functions only, as are the next two
     :param start_method: see `MultiTaskVecEnv`
     :param worker_timeout: see `MultiTaskVecEnv`
+    :param restart_workers: see `MultiTaskVecEnv`; functions only
     :param task_names: names for the tasks of a ready-made vector env
     :param task_of_env: the task index of each env of a ready-made vector env
     :raises ConfigError: if an option or a task cannot work; the message names it
@@ -318,6 +326,7 @@ def make_multitask_env(
         "max_episode_steps": (max_episode_steps, None),
         "n_workers": (n_workers, "auto"),
         "start_method": (start_method, "spawn"),
+        "restart_workers": (restart_workers, False),
     }
     if ready_made:
         for option, (given, default) in building.items():
@@ -344,6 +353,7 @@ def make_multitask_env(
             n_workers=n_workers,
             start_method=start_method,
             worker_timeout=worker_timeout,
+            restart_workers=restart_workers,
         )
     if seed is not None:
         env.seed(seed)

@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 import psutil
 
+from sb3_ars.envs.restarts import MAX_IN_A_ROW, RESTARTED, Restarts
 from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
 
 __all__ = [
@@ -402,13 +404,15 @@ class WorkerPool:
     A step goes through shared memory and two semaphores per worker; nothing is pickled but the infos of episodes
     that ended. Everybody sleeps who has nothing to do: the processors are the learner's too.
 
-    A dead, raising or hanging worker becomes a `WorkerError` that names its tasks, and ends all the others.
+    A dead, raising or hanging worker becomes a `WorkerError` that names its tasks, and ends all the others; with
+    ``restart`` it is replaced where that happens in a step or a reset, see `MultiTaskVecEnv`.
 
     :param factories: one per env; they travel by cloudpickle, so lambdas and classes of a notebook will do
     :param tasks: the task name of each env
     :param n_workers: number of processes, 1 to the number of envs
     :param start_method: "spawn", "fork" or "forkserver"
     :param timeout: seconds a worker may take to answer, except for building its envs
+    :param restart: whether a worker that fails is started anew
     """
 
     arrays: StepArrays
@@ -420,6 +424,7 @@ class WorkerPool:
         n_workers: int,
         start_method: StartMethod = "spawn",
         timeout: float = 25.0,
+        restart: bool = False,
     ) -> None:
         self._tasks = list(tasks)
         self._timeout = timeout
@@ -431,12 +436,16 @@ class WorkerPool:
         self._replies: dict[int, bytes] = {}
         self._processes: list[BaseProcess] = []
         self._lines: list[_Line] = []
+        self._context: Any = multiprocessing.get_context(start_method)
+        self._restarts = Restarts(self._chunks) if restart else None
+        self._may_lose = False  # whether a worker that fails now is started anew
+        self._lost: dict[int, str] = {}  # those, and what became of them
         self._factories = _pickle_factories(factories, tasks)
         self._owner = os.getpid()
         # Both a finalizer (the pool was dropped) and an exit handler (the script ended).
         self._end = weakref.finalize(self, _end_workers, self._processes, self._lines, self._owner)
         try:
-            self._start(start_method)
+            self._start()
         except BaseException:
             self.close()
             raise
@@ -456,12 +465,17 @@ class WorkerPool:
         # Not a multiprocessing.RawArray: that can be given to a process only when it starts, and the sizes
         # are known only once the envs are built there. The file loses its name at once, so that nothing is
         # left over.
+        self._layout = layout
         with _shared_file(layout.offsets()[-1]) as file:
             self.arrays = StepArrays(layout, mmap.mmap(file.fileno(), layout.offsets()[-1]))
             self.activate(np.ones(layout.n_envs, bool))
             self._command(
                 [("attach", (file.name, layout, c.start, c.stop)) for c in self._chunks], "attaching memory"
             )
+            if self._restarts is not None:  # workers that start later find it among this process's open files
+                descriptor = os.dup(file.fileno())
+                weakref.finalize(self, os.close, descriptor)
+                self._memory = f"/proc/{self._owner}/fd/{descriptor}"
 
     def activate(self, active: npt.NDArray[np.bool_]) -> None:
         """Let only these envs step from now on, ``(n_envs,)``; a worker without any of them is not woken."""
@@ -473,26 +487,44 @@ class WorkerPool:
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
     ) -> list[dict[str, Any]]:
         """Start a new episode in every env, first observations in ``arrays.obs``; return the infos."""
+        self._settle()
         seeds, options = list(seeds), list(options)
-        parts = [(seeds[c.start : c.stop], options[c.start : c.stop]) for c in self._chunks]
-        self._command([("reset", part) for part in parts], "resetting its envs")
+        if self._restarts is not None:
+            self._restarts.begin_episodes(seeds)
+        with self._losing():
+            for worker, c in enumerate(self._chunks):
+                self._send(worker, ("reset", (seeds[c.start : c.stop], options[c.start : c.stop])))
+            self._collect(self._timeout, "resetting its envs")
+            self._start_lost_anew(options)
         return self._take_lists()
 
     def step_async(self) -> None:
         """Begin the step of ``arrays.actions``, in the active envs."""
         self._settle()
+        if self._restarts is not None:
+            self._restarts.begin_step(self.arrays)
         for worker in self._stepping:
             self._lines[worker].ask(_STEP)
             self._awaiting.add(worker)
 
     def step_wait(self) -> list[Ended]:
         """Wait for the step; return the episodes that ended, env indices over the whole pool."""
-        self._collect(self._timeout, "stepping its envs")
+        with self._losing():
+            self._collect(self._timeout, "stepping its envs")
+            anew = self._start_lost_anew([{}] * len(self._tasks))
         ended: list[Ended] = []
         for worker, reply in sorted(self._replies.items()):
             start = self._chunks[worker].start
-            ended += [end._replace(env=end.env + start) for end in self._loads(worker, reply)]
+            if worker in anew:
+                infos = enumerate(self._loads(worker, reply), start)
+                ended += [Ended(env, {RESTARTED: True}, info) for env, info in infos]
+            else:
+                ended += [end._replace(env=end.env + start) for end in self._loads(worker, reply)]
         self._replies.clear()
+        if self._restarts is not None:
+            for worker in anew:
+                self._restarts.break_off(worker, self.arrays)
+            self._restarts.end_step(self.arrays, [worker for worker in self._stepping if worker not in anew])
         return ended
 
     def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
@@ -524,24 +556,22 @@ class WorkerPool:
         """Return the process ids of the workers that have not been ended."""
         return [process.pid for process in self._processes if process.pid is not None]
 
-    def _start(self, start_method: StartMethod) -> None:
-        context: Any = multiprocessing.get_context(start_method)
+    def _start(self) -> None:
         with _hidden_main(), _single_threaded():
             for worker in range(len(self._chunks)):
                 try:
-                    self._start_one(worker, context)
+                    line, process = self._start_one(worker)
                 except (OSError, EOFError) as error:
-                    raise ConfigError(
-                        f"{self._name(worker)} could not be started ({error or type(error).__name__}). {_remedy(error)}"
-                    ) from error
+                    raise ConfigError(self._not_started(worker, error)) from error
+                self._lines.append(line)
+                self._processes.append(process)
 
-    def _start_one(self, worker: int, context: Any) -> None:
-        chunk = self._chunks[worker]
+    def _start_one(self, worker: int) -> tuple[_Line, BaseProcess]:
+        chunk, context = self._chunks[worker], self._context
         ours, theirs = context.Pipe()
         line = _Line(ours, context.Semaphore(0), context.Semaphore(0), context.RawArray("B", 2))
-        # A forked child holds copies of the pipes before it and would keep them open after the parent died.
+        # A forked child holds copies of the other pipes and would keep them open after the parent died.
         stale = [line.conn for line in self._lines] + [ours] if context.get_start_method() == "fork" else []
-        self._lines.append(line)
         # The factories follow through our own pipe: a child that dies before it has read what it is started
         # with would let multiprocessing wait for ever, once that is longer than a pipe holds.
         envs = TaskEnvs((), self._tasks[chunk.start : chunk.stop])
@@ -552,9 +582,81 @@ class WorkerPool:
             daemon=True,
         )
         process.start()
-        self._processes.append(process)
         # Else a dead worker's pipe would never reach its end here.
         theirs.close()
+        return line, process
+
+    def _not_started(self, worker: int, error: OSError | EOFError) -> str:
+        return (
+            f"{self._name(worker)} could not be started ({error or type(error).__name__}). {_remedy(error)}"
+        )
+
+    @contextlib.contextmanager
+    def _losing(self) -> Iterator[None]:
+        """Let workers that fail meanwhile be lost, where they may be started anew."""
+        self._may_lose = self._restarts is not None
+        try:
+            yield
+        finally:
+            self._may_lose = False
+            self._lost.clear()
+
+    def _lose(self, workers: Sequence[int], message: str) -> None:
+        """Note that workers failed, and why; end all and raise where none may be started anew."""
+        if not self._may_lose:
+            self._fail(message)
+        for worker in workers:
+            self._lost[worker] = message
+            self._awaiting.discard(worker)
+            self._replies.pop(worker, None)
+
+    def _start_lost_anew(self, options: Sequence[Mapping[str, Any]]) -> list[int]:
+        """Put new processes in the place of lost ones; their replies are then those of a reset.
+
+        :param options: of the reset, one per env
+        :return: which workers are new
+        """
+        said, anew = [], set()
+        while self._lost and self._restarts is not None:
+            worker, reason = min(self._lost.items())
+            del self._lost[worker]
+            number = self._restarts.count(worker)
+            if not number:
+                self._fail(
+                    f"{reason} It was started anew {MAX_IN_A_ROW} times in a row, and no step worked since."
+                )
+            said.append(
+                f"{reason} The envs of {self._name(worker)} were built anew, restart {number} of this worker; their "
+                "episodes end as truncated, and this step of theirs is not learned."
+            )
+            anew.add(worker)
+            c = self._chunks[worker]
+            self._start_anew(worker, (self._restarts.seeds(worker), options[c.start : c.stop]))
+        for message in said:
+            warnings.warn(message, stacklevel=4)
+        return sorted(anew)
+
+    def _start_anew(self, worker: int, reset: tuple[Any, ...]) -> None:
+        """Replace a worker's process, and build and reset its envs; if that fails it is lost once more."""
+        _end_workers([self._processes[worker]], [self._lines[worker]], self._owner, grace=1.0)
+        try:
+            with _hidden_main(), _single_threaded():
+                self._lines[worker], self._processes[worker] = self._start_one(worker)
+        except (OSError, EOFError) as error:
+            self._lose([worker], self._not_started(worker, error))
+            return
+        c = self._chunks[worker]
+        for doing, message in (
+            ("building its envs anew", ("build", (self._factories[c.start : c.stop],))),
+            ("attaching memory", ("attach", (self._memory, self._layout, c.start, c.stop))),
+            ("resetting its envs", ("reset", reset)),
+        ):
+            self._replies.pop(worker, None)
+            patience = max(START_TIMEOUT, self._timeout) if message[0] == "build" else self._timeout
+            self._send(worker, message, patience)
+            self._collect(patience, doing)
+            if worker in self._lost:
+                return
 
     def _command(self, messages: Sequence[tuple[str, tuple[Any, ...]]], doing: str) -> None:
         self._send_all(messages)
@@ -584,9 +686,9 @@ class WorkerPool:
             _limit_waiting(line.conn, seconds)
             line.conn.send_bytes(data)
         except BlockingIOError:
-            self._fail_hung(seconds, f"being sent {message[0]!r}", [worker])
+            self._lose_hung(seconds, f"being sent {message[0]!r}", [worker])
         except OSError:
-            self._fail_dead(worker, "before it could be asked")
+            self._lose_dead(worker, "before it could be asked")
 
     def _collect(self, timeout: float, doing: str, fatal: bool = True) -> None:
         self._check_owner()
@@ -601,11 +703,13 @@ class WorkerPool:
                 if self._lines[worker].done.acquire(block=False):
                     self._receive(worker, doing, fatal)
                 elif worker in dead:
-                    self._fail_dead(worker, f"while {doing}")
+                    self._lose_dead(worker, f"while {doing}")
             waited = time.monotonic() - begin
             # building may take longer than a step, but not while the process is stopped
-            if self._awaiting and (waited > timeout or (waited > self._timeout and self._stopped())):
-                self._fail_hung(min(waited, timeout), doing)
+            hung = sorted(self._awaiting) if waited > timeout else []
+            hung = hung or (self._stopped() if waited > self._timeout else [])
+            if hung:
+                self._lose_hung(min(waited, timeout), doing, hung)
 
     def _stopped(self) -> list[int]:
         """Return which of the awaited workers a signal has stopped, so that they cannot answer."""
@@ -624,15 +728,15 @@ class WorkerPool:
         if line.words[_ANSWER] == _REPLY:
             try:
                 if not line.conn.poll(self._timeout):  # stopped between its wake-up and its message
-                    self._fail_hung(self._timeout, doing)
+                    raise BlockingIOError
                 self._replies[worker] = line.conn.recv_bytes()
             except BlockingIOError:  # stopped in the middle of its message
-                self._fail_hung(self._timeout, doing)
+                self._lose_hung(self._timeout, doing, [worker])
             except (EOFError, OSError):
-                self._fail_dead(worker, f"while {doing}")
+                self._lose_dead(worker, f"while {doing}")
         self._awaiting.discard(worker)
         if fatal and self._replies.get(worker, b"")[:1] == _ERROR:
-            self._fail_raised(self._replies[worker], doing)
+            self._lose_raising(worker, self._replies[worker], doing)
 
     def _take_lists(self) -> list[Any]:
         parts = [self._loads(worker, self._replies.pop(worker)) for worker in range(len(self._chunks))]
@@ -652,7 +756,7 @@ class WorkerPool:
         tasks = dict.fromkeys(self._tasks[chunk.start : chunk.stop])
         return f"Env worker {worker} (task{'s' * (len(tasks) > 1)} {', '.join(map(repr, tasks))})"
 
-    def _fail_dead(self, worker: int, when: str) -> NoReturn:
+    def _lose_dead(self, worker: int, when: str) -> None:
         process = self._processes[worker]
         process.join(1.0)
         code = process.exitcode
@@ -661,26 +765,32 @@ class WorkerPool:
             if code is not None and code < 0
             else f"exited with {code}"
         )
-        hint = (
-            " Out of memory is the usual reason for SIGKILL: use fewer envs or workers." if code == -9 else ""
-        )
-        self._fail(
-            f"{self._name(worker)} {how} {when}.{hint} Its last words, if any, are on the error output."
+        hint = {
+            -signal.SIGKILL: " Out of memory is the usual reason for SIGKILL: use fewer envs or workers.",
+            # Python's multiprocessing then ends what it takes for children of its own
+            -signal.SIGTERM: " So it is when a child of os.fork() ends, unless by os._exit().",
+        }.get(code or 0, "")
+        self._lose(
+            [worker],
+            f"{self._name(worker)} {how} {when}.{hint} Its last words, if any, are on the error output.",
         )
 
-    def _fail_hung(self, timeout: float, doing: str, workers: Sequence[int] | None = None) -> NoReturn:
-        hung = sorted(self._awaiting) if workers is None else workers
-        names = "; ".join(self._name(worker) for worker in hung)
-        stopped = any(_is_stopped(self._processes[worker]) for worker in hung)
+    def _lose_hung(self, timeout: float, doing: str, workers: Sequence[int]) -> None:
+        names = "; ".join(self._name(worker) for worker in workers)
+        stopped = any(_is_stopped(self._processes[worker]) for worker in workers)
         why = (
             "A signal has stopped it (SIGSTOP, or Ctrl-Z in its terminal)."
             if stopped
             else "If the env is only slow, raise worker_timeout; if it hangs, try n_workers=0 to see where."
         )
-        self._fail(f"{names} did not answer within {timeout:g} s while {doing}. {why}")
+        self._lose(workers, f"{names} did not answer within {timeout:g} s while {doing}. {why}")
 
-    def _fail_raised(self, reply: bytes, doing: str) -> NoReturn:
+    def _lose_raising(self, worker: int, reply: bytes, doing: str) -> None:
         task, trace, error = _read_error(reply)
+        if self._may_lose and not isinstance(error, EnvContractError):
+            last = trace.strip().splitlines()[-1]
+            self._lose([worker], f"The env of task {task!r} raised {last!r} while {doing}.")
+            return
         self.close()
         if isinstance(error, ConfigError | EnvContractError):
             raise error from WorkerError(f"in the worker:\n\n{trace}")
