@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-import psutil
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
@@ -20,6 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ars.core.reward_scale import RewardStatistics
 from sb3_ars.errors import ConfigError, EnvContractError, check_count
+from sb3_ars.machine import available_memory
 
 __all__ = ["TaskReplayBuffer"]
 
@@ -297,7 +297,7 @@ class TaskReplayBuffer(ReplayBuffer):
         if th.device(self.device).type == "cuda":
             available, _ = th.cuda.mem_get_info(self.device)
         else:
-            available = psutil.virtual_memory().available
+            available = available_memory()
         if self.memory_bytes() > available:
             fits = int(self.buffer_size * available / self.memory_bytes() * 0.9)
             raise ConfigError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from sb3_ars.envs.workers import EnvFactory, EnvFacts
 from sb3_ars.errors import ConfigError, check_count, nearest
+from sb3_ars.machine import available_cpus
 
 __all__ = [
     "CommonSpaces",
@@ -101,7 +101,7 @@ def check_n_workers(value: object, n_envs: int) -> int:
     """
     daemonic = multiprocessing.current_process().daemon
     if value == "auto":
-        n_cpus = _available_cpus()
+        n_cpus = available_cpus()
         return 0 if min(n_envs, n_cpus) == 1 or daemonic else min(n_envs, n_cpus)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise ConfigError(f"n_workers must be 'auto' or an integer of at least 0, got {value!r}.")
@@ -332,10 +332,3 @@ def _check_action_space(task: str, space: gym.Space[Any]) -> None:
 def _box(space: gym.Space[Any]) -> gym.spaces.Box:
     assert isinstance(space, gym.spaces.Box)
     return space
-
-
-def _available_cpus() -> int:
-    # Not os.cpu_count(): a container or a job scheduler may lend only some of them.
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
