@@ -626,8 +626,8 @@ class WorkerPool:
                     f"{reason} It was started anew {MAX_IN_A_ROW} times in a row, and no step worked since."
                 )
             said.append(
-                f"{reason} The envs of {self._name(worker)} were built anew, restart {number} of this worker; their "
-                "episodes end as truncated, and this step of theirs is not learned."
+                f"{reason} {self._name(worker)} was started anew, restart {number} of this worker: the running "
+                "episodes of its envs end as truncated, and what their actions led to is not learned."
             )
             anew.add(worker)
             c = self._chunks[worker]
