@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ars.core.reward_scale import RewardStatistics
 from sb3_ars.errors import ConfigError, EnvContractError, check_count
+from sb3_ars.machine import available_memory
 
 __all__ = ["TaskReplayBuffer"]
 
@@ -124,6 +125,8 @@ class TaskReplayBuffer(ReplayBuffer):
     ) -> None:
         """Store one transition of every environment in its task's ring, but for tasks that are not active.
 
+        An environment whose info has ``worker_restarted`` is left out as well: what its action led to is unknown.
+
         On a GPU this is one asynchronous transfer and waits for nothing.
 
         :param obs: ``(n_envs, obs_dim)``, one-hot included
@@ -135,6 +138,25 @@ class TaskReplayBuffer(ReplayBuffer):
         :raises EnvContractError: if a value is NaN or infinite, or a terminal observation is missing
         """
         self._allocate()
+        unknown = [env for env in np.flatnonzero(done) if infos[env].get("worker_restarted")]
+        if not unknown:
+            self._add_rows(obs, next_obs, action, reward, done, infos)
+            return
+        chosen = self._env_of_row
+        self._choose_rows(np.setdiff1d(chosen, unknown))
+        if len(self._env_of_row):
+            self._add_rows(obs, next_obs, action, reward, done, infos)
+        self._choose_rows(chosen)
+
+    def _add_rows(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
         host, rows = self._staging.begin(), self._rows
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinity, which is refused below
             host["observations"][:] = np.asarray(obs)[rows, : self.obs_dim]
@@ -292,7 +314,7 @@ class TaskReplayBuffer(ReplayBuffer):
         if th.device(self.device).type == "cuda":
             available, _ = th.cuda.mem_get_info(self.device)
         else:
-            available = psutil.virtual_memory().available
+            available = available_memory()
         if self.memory_bytes() > available:
             fits = int(self.buffer_size * available / self.memory_bytes() * 0.9)
             raise ConfigError(
@@ -344,10 +366,16 @@ class TaskReplayBuffer(ReplayBuffer):
             raise ConfigError(
                 f"tasks={tasks} must be None or some of the task indices 0 to {self.n_tasks - 1}."
             )
-        is_active = np.isin(self.task_of_env, list(active))
-        self._env_of_row = np.flatnonzero(is_active)
+        self._choose_rows(np.flatnonzero(np.isin(self.task_of_env, list(active))))
+
+    def _choose_rows(self, envs: np.ndarray) -> None:
+        """Let the transitions of these environments be stored, and no others.
+
+        :param envs: indices, ascending
+        """
+        self._env_of_row = envs
         # a slice where it can be: then no step copies its arrays once more
-        self._rows = slice(None) if is_active.all() else self._env_of_row
+        self._rows = slice(None) if len(envs) == self.n_envs else envs
         self._task_of_row = self.task_of_env[self._rows]
         self._rows_of_task = np.bincount(self._task_of_row, minlength=self.n_tasks)
         of_row = self._task_of_row.tolist()
@@ -454,6 +482,7 @@ class TaskReplayBuffer(ReplayBuffer):
         self.task_size[:], self.task_pos[:] = np.minimum(total, self.buffer_size), total % self.buffer_size
         self.task_total, self.history = total, state["history"]
         if total.any():
+            self.check_memory()
             self._allocate()
         try:
             self._read_parts(parts)

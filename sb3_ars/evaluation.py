@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from sb3_ars.envs import make_metaworld_env
 from sb3_ars.envs.metaworld import Goals
-from sb3_ars.errors import ConfigError, nearest
+from sb3_ars.errors import ConfigError, WorkerError, nearest
 from sb3_ars.metrics import mean_success, success_rates
 
 __all__ = [
@@ -203,6 +203,11 @@ def _evaluate(
             actions, _ = model.predict(obs, deterministic=deterministic)
             obs, _, dones, infos = env.step(actions)
             for index in np.flatnonzero(dones):
+                if infos[index].get("worker_restarted"):
+                    raise WorkerError(
+                        f"The env of task {task_names[task_of_env[index]]!r} was built anew in the middle of the "
+                        "evaluation, whose episodes are then not the protocol's. Evaluate again."
+                    )
                 if len(episodes[index]) < wanted[index]:
                     episodes[index].append(_outcome(infos[index]))
                     bar.update()

@@ -11,6 +11,8 @@ from typing import Any
 import psutil
 import torch as th
 
+from sb3_ars.machine import available_cpus
+
 __all__ = ["PACKAGES", "available_cpus", "cpu_info", "run_versions"]
 
 PACKAGES = (
@@ -37,15 +39,6 @@ def run_versions() -> dict[str, Any]:
         "packages": {name: _version(name) for name in PACKAGES},
         "commit": _commit(),
     }
-
-
-def available_cpus() -> int:
-    """Return how many processors this process may use."""
-    return (
-        len(psutil.Process().cpu_affinity())
-        if hasattr(psutil.Process, "cpu_affinity")
-        else psutil.cpu_count() or 1
-    )
 
 
 def cpu_info(key: str) -> str | None:

@@ -514,5 +514,5 @@ def test_a_vec_env_without_terminal_observation_is_an_error():
 
 @pytest.mark.parametrize(("n_envs", "n_cpus", "expected"), [(1, 8, 0), (4, 1, 0), (4, 2, 2), (4, 8, 4)])
 def test_auto_takes_a_worker_per_cpu_but_none_for_one(monkeypatch, n_envs, n_cpus, expected):
-    monkeypatch.setattr(checks, "_available_cpus", lambda: n_cpus)
+    monkeypatch.setattr(checks, "available_cpus", lambda: n_cpus)
     assert checks.check_n_workers("auto", n_envs) == expected

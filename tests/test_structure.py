@@ -16,7 +16,7 @@ from benchmarks.toy_methods import summary
 
 ROOT = Path(sb3_ars.__file__).parent
 LAYER = {  # each may import those before it, and its own
-    "errors": 0, "files": 0, "plain": 0, "profiling": 0, "checkpoints": 1, "core": 1,
+    "errors": 0, "files": 0, "machine": 0, "plain": 0, "profiling": 0, "checkpoints": 1, "core": 1,
     "nets": 2, "metrics": 2, "versions": 2, "config": 2, "envs": 2, "task_id": 2,
     "buffers": 3, "policies": 3, "policy_description": 3,
     "callbacks.ars": 4,  # beneath the algorithms, whose learn() installs it

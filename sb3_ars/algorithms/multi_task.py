@@ -821,6 +821,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         super()._update_info_buffer(infos, dones)
         if self.is_multi_task and dones is not None:
             for env in np.flatnonzero(dones):
+                if infos[env].get("worker_restarted"):  # it broke off, so its return and success are unknown
+                    continue
                 self._task_log.add_episode(self.task_of_env[env], infos[env])
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:

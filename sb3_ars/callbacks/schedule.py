@@ -87,7 +87,11 @@ class TaskScheduleCallback(BaseCallback):
                 update_scale_and_networks(model)
 
     def _on_step(self) -> bool:
-        ended = np.flatnonzero(self.locals["dones"])
+        infos = self.locals["infos"]
+        # an episode that broke off with its worker says nothing about the task
+        ended = [
+            env for env in np.flatnonzero(self.locals["dones"]) if not infos[env].get("worker_restarted")
+        ]
         if not len(ended):
             return True
         successes = [self._success(int(env)) for env in ended]  # in the random phase too: it may be missing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from sb3_ars.envs.workers import EnvFactory, EnvFacts
 from sb3_ars.errors import ConfigError, check_count, nearest
+from sb3_ars.machine import available_cpus
 
 __all__ = [
     "CommonSpaces",
@@ -24,6 +25,7 @@ __all__ = [
     "check_equal_spaces",
     "check_n_workers",
     "check_raw_rewards",
+    "check_restart_workers",
     "check_seed",
     "check_start_method",
     "check_task_names",
@@ -99,7 +101,7 @@ def check_n_workers(value: object, n_envs: int) -> int:
     """
     daemonic = multiprocessing.current_process().daemon
     if value == "auto":
-        n_cpus = _available_cpus()
+        n_cpus = available_cpus()
         return 0 if min(n_envs, n_cpus) == 1 or daemonic else min(n_envs, n_cpus)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise ConfigError(f"n_workers must be 'auto' or an integer of at least 0, got {value!r}.")
@@ -113,6 +115,32 @@ def check_n_workers(value: object, n_envs: int) -> int:
             f"n_workers={value}: this process is daemonic and may not start others. Use n_workers=0."
         )
     return int(value)
+
+
+def check_restart_workers(value: object, n_workers: object, processes: int) -> tuple[bool, int]:
+    """Return whether workers are started anew, and how many there are: "auto" then is one at least.
+
+    :param value: of the option
+    :param n_workers: what was asked for
+    :param processes: what `check_n_workers` made of it
+    :raises ConfigError: if there are no workers, or no way to give a late one the arrays
+    """
+    if not isinstance(value, bool):
+        raise ConfigError(f"restart_workers={value!r} must be True or False.")
+    if not value:
+        return False, processes
+    if not sys.platform.startswith("linux"):
+        raise ConfigError(
+            "restart_workers=True needs Linux, whose /proc gives a new worker the shared arrays."
+        )
+    if n_workers == "auto" and not multiprocessing.current_process().daemon:
+        processes = max(processes, 1)
+    if not processes:
+        raise ConfigError(
+            f"restart_workers=True with n_workers={n_workers!r}: the envs are stepped in this process, which cannot be "
+            "started anew. Give n_workers=1 or more, or leave restart_workers out."
+        )
+    return True, processes
 
 
 def pairs_of_tasks(
@@ -304,10 +332,3 @@ def _check_action_space(task: str, space: gym.Space[Any]) -> None:
 def _box(space: gym.Space[Any]) -> gym.spaces.Box:
     assert isinstance(space, gym.spaces.Box)
     return space
-
-
-def _available_cpus() -> int:
-    # Not os.cpu_count(): a container or a job scheduler may lend only some of them.
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

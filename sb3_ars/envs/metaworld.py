@@ -165,11 +165,12 @@ def make_metaworld_env(
     n_goals: int = 50,
     goal_seed: int = 0,
     start_method: str = "spawn",
-    worker_timeout: float = 30.0,
+    worker_timeout: float = 25.0,
     render_mode: str | None = None,
     fast: bool = True,
     render_size: int = 480,
     camera: str = DEFAULT_CAMERA,
+    restart_workers: bool = False,
 ) -> MultiTaskVecEnv:
     """Return a VecEnv of Meta-World tasks: goals visible, rewards raw, one-hot task id in the observation.
 
@@ -189,6 +190,7 @@ def make_metaworld_env(
     :param fast: see `MetaworldTask`
     :param render_size: see `MetaworldTask`
     :param camera: see `MetaworldTask`
+    :param restart_workers: see `MultiTaskVecEnv`
     :raises ConfigError: if an option or a name cannot work, or nothing can draw what is to be rendered; the message
         names it
     :raises ImportError: if Meta-World is not installed
@@ -231,6 +233,7 @@ def make_metaworld_env(
         n_workers=n_workers,
         start_method=start_method,
         worker_timeout=worker_timeout,
+        restart_workers=restart_workers,
     )
     env.goals, env.n_goals = goals, n_goals
     return env

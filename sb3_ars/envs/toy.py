@@ -131,10 +131,11 @@ def make_toy_env(
     reward_scales: Sequence[float] = _SCALES,
     max_episode_steps: int = 50,
     start_method: str = "spawn",
-    worker_timeout: float = 30.0,
+    worker_timeout: float = 25.0,
     tasks: Sequence[str] | None = None,
     render_mode: str | None = None,
     render_size: int = 320,
+    restart_workers: bool = False,
 ) -> MultiTaskVecEnv:
     """Return a VecEnv of point-mass tasks (`PointTask`) whose rewards differ by orders of magnitude.
 
@@ -150,6 +151,7 @@ def make_toy_env(
     :param tasks: names of those wanted, such as "point-west"; all by default
     :param render_mode: see `PointTask`
     :param render_size: see `PointTask`
+    :param restart_workers: see `MultiTaskVecEnv`
     :raises ConfigError: if an option cannot work; the message names it
     """
     from sb3_ars.envs import checks
@@ -176,6 +178,7 @@ def make_toy_env(
         n_workers=n_workers,
         start_method=start_method,
         worker_timeout=worker_timeout,
+        restart_workers=restart_workers,
     )
 
 

@@ -45,6 +45,10 @@ class MultiTaskVecEnv(VecEnv):
     :param n_workers: worker processes; 0 steps the envs here, "auto" uses the available CPUs
     :param start_method: "spawn", "fork" or "forkserver"; any works without ``if __name__ == "__main__"``
     :param worker_timeout: seconds a worker may take to answer before it counts as hung
+    :param restart_workers: whether a worker that dies, hangs or whose env raises in a step or a reset is started anew,
+        with a warning, three times in a row at most: its envs are built again, with seeds that follow from theirs, and
+        their episodes end as truncated, with ``worker_restarted`` in the info of that step, which has no outcome. Needs
+        workers and Linux
     :raises ConfigError: if an option or a task cannot work; the message names it
     """
 
@@ -56,7 +60,8 @@ class MultiTaskVecEnv(VecEnv):
         seed: int | None = None,
         n_workers: int | str = "auto",
         start_method: str = "spawn",
-        worker_timeout: float = 30.0,
+        worker_timeout: float = 25.0,
+        restart_workers: bool = False,
     ) -> None:
         self._closed_because: str | None = "it was never completely built"
         per_task = checks.check_count("n_envs_per_task", n_envs_per_task)
@@ -71,6 +76,7 @@ class MultiTaskVecEnv(VecEnv):
         """How many stored goals each task has, where the tasks are Meta-World's."""
         n_envs = len(factories)
         processes = checks.check_n_workers(n_workers, n_envs)
+        restart, processes = checks.check_restart_workers(restart_workers, n_workers, processes)
         method: Any = checks.check_start_method(start_method)
         timeout = checks.check_timeout(worker_timeout)
         checks.check_seed(seed)
@@ -79,7 +85,7 @@ class MultiTaskVecEnv(VecEnv):
         self._stepping = False
         names = [self.task_names[task] for task in self.task_of_env]
         self._runner: EnvRunner = (
-            WorkerPool(factories, names, processes, method, timeout)
+            WorkerPool(factories, names, processes, method, timeout, restart)
             if processes
             else TaskEnvs(factories, names)
         )
@@ -160,9 +166,13 @@ class MultiTaskVecEnv(VecEnv):
             episodes = self._runner.episodes()
         if len(episodes) < self.num_envs:
             raise RuntimeError("checkpoint_state() before reset(): no episode has begun.")
-        # a reset that is asked for but not made yet
-        pending = {"seeds": self._seeds, "options": self._options}
-        return {"episodes": [dataclasses.asdict(episode) for episode in episodes], **pending}
+        restarts = self._runner.restarts
+        return {
+            "episodes": [dataclasses.asdict(episode) for episode in episodes],
+            "seeds": self._seeds,  # of a reset that is asked for but not made yet
+            "options": self._options,
+            "restarts": None if restarts is None else restarts.checkpoint_state(),
+        }
 
     def restore_checkpoint_state(self, state: Mapping[str, Any]) -> npt.NDArray[np.float32]:
         """Bring every env to the middle of the episode it was in; return the observations, as `reset` does.
@@ -183,6 +193,8 @@ class MultiTaskVecEnv(VecEnv):
         with self._guarded("playing its episodes again"):
             problems = self._runner.play_again([SavedEpisode.of(episode) for episode in state["episodes"]])
         self.reset_infos = [{} for _ in range(self.num_envs)]
+        if self._runner.restarts is not None and state["restarts"] is not None:
+            self._runner.restarts.restore_checkpoint_state(state["restarts"])
         self._seeds, self._options = list(state["seeds"]), list(state["options"])
         for index, problem in enumerate(problems):
             if problem is not None:
@@ -338,7 +350,8 @@ def make_multitask_env(
     max_episode_steps: int | None = None,
     n_workers: int | str = "auto",
     start_method: str = "spawn",
-    worker_timeout: float = 30.0,
+    worker_timeout: float = 25.0,
+    restart_workers: bool = False,
     task_names: Sequence[str] | None = None,
     task_of_env: Sequence[int] | None = None,
 ) -> VecEnv:
@@ -353,6 +366,7 @@ def make_multitask_env(
     :param n_workers: see `MultiTaskVecEnv`; functions only, as are the next two
     :param start_method: see `MultiTaskVecEnv`
     :param worker_timeout: see `MultiTaskVecEnv`
+    :param restart_workers: see `MultiTaskVecEnv`; functions only
     :param task_names: names for the tasks of a ready-made vector env
     :param task_of_env: the task index of each env of a ready-made vector env
     :raises ConfigError: if an option or a task cannot work; the message names it
@@ -364,6 +378,7 @@ def make_multitask_env(
         "max_episode_steps": (max_episode_steps, None),
         "n_workers": (n_workers, "auto"),
         "start_method": (start_method, "spawn"),
+        "restart_workers": (restart_workers, False),
     }
     if ready_made:
         for option, (given, default) in building.items():
@@ -390,6 +405,7 @@ def make_multitask_env(
             n_workers=n_workers,
             start_method=start_method,
             worker_timeout=worker_timeout,
+            restart_workers=restart_workers,
         )
     if seed is not None:
         env.seed(seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import math
 import mmap
@@ -10,10 +11,13 @@ import multiprocessing
 import os
 import pickle
 import signal
+import socket
+import struct
 import sys
 import tempfile
 import time
 import traceback
+import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,8 +29,10 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+import psutil
 
 from sb3_ars.envs.replay import LONGEST_REPLAY, Episode, SavedEpisode, layers, remember_start, restore_start
+from sb3_ars.envs.restarts import MAX_IN_A_ROW, RESTARTED, Restarts
 from sb3_ars.errors import ConfigError, EnvContractError, WorkerError
 
 __all__ = [
@@ -187,6 +193,10 @@ class EnvRunner(Protocol):
     def play_again(self, episodes: Sequence[SavedEpisode]) -> list[str | None]:
         """Bring every env to where its episode was; return why not, for those that now begin a new one."""
 
+    @property
+    def restarts(self) -> Restarts | None:
+        """What is known of workers that may be started anew."""
+
     def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
         """Return the answers of the named envs to a command of `TaskEnvs`."""
 
@@ -202,6 +212,7 @@ class TaskEnvs:
     """
 
     arrays: StepArrays
+    restarts: Restarts | None = None
 
     def __init__(self, factories: Sequence[EnvFactory], tasks: Sequence[str]) -> None:
         self._factories = factories
@@ -214,11 +225,13 @@ class TaskEnvs:
         self.current = 0
         """Index of the env that was touched last: the one to blame for an exception."""
 
-    def build(self) -> list[EnvFacts]:
+    def build(self, factories: Sequence[EnvFactory] | None = None) -> list[EnvFacts]:
         """Build the envs and return what they are.
 
+        :param factories: one per env, where they were not given at first: a worker hears of them once it runs
         :raises ConfigError: if a factory raises or does not return a ``gymnasium.Env``
         """
+        self._factories = self._factories if factories is None else factories
         facts = []
         for index, factory in enumerate(self._factories):
             self.current = index
@@ -452,13 +465,15 @@ class WorkerPool:
     A step goes through shared memory and two semaphores per worker; nothing is pickled but the infos of episodes
     that ended. Everybody sleeps who has nothing to do: the processors are the learner's too.
 
-    A dead, raising or hanging worker becomes a `WorkerError` that names its tasks, and ends all the others.
+    A dead, raising or hanging worker becomes a `WorkerError` that names its tasks, and ends all the others; with
+    ``restart`` it is replaced where that happens in a step or a reset, see `MultiTaskVecEnv`.
 
     :param factories: one per env; they travel by cloudpickle, so lambdas and classes of a notebook will do
     :param tasks: the task name of each env
     :param n_workers: number of processes, 1 to the number of envs
     :param start_method: "spawn", "fork" or "forkserver"
     :param timeout: seconds a worker may take to answer, except for building its envs
+    :param restart: whether a worker that fails is started anew
     """
 
     arrays: StepArrays
@@ -469,7 +484,8 @@ class WorkerPool:
         tasks: Sequence[str],
         n_workers: int,
         start_method: StartMethod = "spawn",
-        timeout: float = 30.0,
+        timeout: float = 25.0,
+        restart: bool = False,
     ) -> None:
         self._tasks = list(tasks)
         self._timeout = timeout
@@ -481,11 +497,16 @@ class WorkerPool:
         self._replies: dict[int, bytes] = {}
         self._processes: list[BaseProcess] = []
         self._lines: list[_Line] = []
-        pickled = _pickle_factories(factories, tasks)
+        self._context: Any = multiprocessing.get_context(start_method)
+        self.restarts = Restarts(self._chunks) if restart else None
+        self._may_lose = False  # whether a worker that fails now is started anew
+        self._lost: dict[int, str] = {}  # those, and what became of them
+        self._factories = _pickle_factories(factories, tasks)
+        self._owner = os.getpid()
         # Both a finalizer (the pool was dropped) and an exit handler (the script ended).
-        self._end = weakref.finalize(self, _end_workers, self._processes, self._lines, os.getpid())
+        self._end = weakref.finalize(self, _end_workers, self._processes, self._lines, self._owner)
         try:
-            self._start(pickled, start_method)
+            self._start()
         except BaseException:
             self.close()
             raise
@@ -495,8 +516,9 @@ class WorkerPool:
 
         :raises ConfigError: as `TaskEnvs.build`; its cause holds the worker's traceback
         """
-        self._send_all([("build", ())] * len(self._chunks))
-        self._collect(max(START_TIMEOUT, self._timeout), "building its envs")
+        patience = max(START_TIMEOUT, self._timeout)
+        self._send_all([("build", (self._factories[c.start : c.stop],)) for c in self._chunks], patience)
+        self._collect(patience, "building its envs")
         return self._take_lists()
 
     def allocate(self, layout: StepLayout) -> None:
@@ -504,15 +526,17 @@ class WorkerPool:
         # Not a multiprocessing.RawArray: that can be given to a process only when it starts, and the sizes
         # are known only once the envs are built there. The file loses its name at once, so that nothing is
         # left over.
-        shm = "/dev/shm"
-        folder = shm if os.access(shm, os.W_OK) else None
-        with tempfile.NamedTemporaryFile(prefix="sb3_ars_", dir=folder) as file:
-            file.truncate(layout.offsets()[-1])
+        self._layout = layout
+        with _shared_file(layout.offsets()[-1]) as file:
             self.arrays = StepArrays(layout, mmap.mmap(file.fileno(), layout.offsets()[-1]))
             self.activate(np.ones(layout.n_envs, bool))
             self._command(
                 [("attach", (file.name, layout, c.start, c.stop)) for c in self._chunks], "attaching memory"
             )
+            if self.restarts is not None:  # workers that start later find it among this process's open files
+                descriptor = os.dup(file.fileno())
+                weakref.finalize(self, os.close, descriptor)
+                self._memory = f"/proc/{self._owner}/fd/{descriptor}"
 
     def activate(self, active: npt.NDArray[np.bool_]) -> None:
         """Let only these envs step from now on, ``(n_envs,)``; a worker without any of them is not woken."""
@@ -524,9 +548,15 @@ class WorkerPool:
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
     ) -> list[dict[str, Any]]:
         """Start a new episode in every env, first observations in ``arrays.obs``; return the infos."""
+        self._settle()
         seeds, options = list(seeds), list(options)
-        parts = [(seeds[c.start : c.stop], options[c.start : c.stop]) for c in self._chunks]
-        self._command([("reset", part) for part in parts], "resetting its envs")
+        if self.restarts is not None:
+            self.restarts.begin_episodes(seeds)
+        with self._losing():
+            for worker, c in enumerate(self._chunks):
+                self._send(worker, ("reset", (seeds[c.start : c.stop], options[c.start : c.stop])))
+            self._collect(self._timeout, "resetting its envs")
+            self._start_lost_anew(options)
         return self._take_lists()
 
     def episodes(self) -> list[SavedEpisode]:
@@ -544,18 +574,30 @@ class WorkerPool:
     def step_async(self) -> None:
         """Begin the step of ``arrays.actions``, in the active envs."""
         self._settle()
+        if self.restarts is not None:
+            self.restarts.begin_step(self.arrays)
         for worker in self._stepping:
             self._lines[worker].ask(_STEP)
             self._awaiting.add(worker)
 
     def step_wait(self) -> list[Ended]:
         """Wait for the step; return the episodes that ended, env indices over the whole pool."""
-        self._collect(self._timeout, "stepping its envs")
+        with self._losing():
+            self._collect(self._timeout, "stepping its envs")
+            anew = self._start_lost_anew([{}] * len(self._tasks))
         ended: list[Ended] = []
         for worker, reply in sorted(self._replies.items()):
             start = self._chunks[worker].start
-            ended += [end._replace(env=end.env + start) for end in pickle.loads(reply[1:])]
+            if worker in anew:
+                infos = enumerate(self._loads(worker, reply), start)
+                ended += [Ended(env, {RESTARTED: True}, info) for env, info in infos]
+            else:
+                ended += [end._replace(env=end.env + start) for end in self._loads(worker, reply)]
         self._replies.clear()
+        if self.restarts is not None:
+            for worker in anew:
+                self.restarts.break_off(worker, self.arrays)
+            self.restarts.end_step(self.arrays, [worker for worker in self._stepping if worker not in anew])
         return ended
 
     def call(self, command: str, indices: Sequence[int], *args: Any) -> list[Any]:
@@ -575,7 +617,7 @@ class WorkerPool:
         for worker, chosen in wanted.items():
             if replies[worker][:1] == _ERROR:
                 self._raise_original(replies[worker])
-            answers.update(zip(chosen, pickle.loads(replies[worker][1:]), strict=True))
+            answers.update(zip(chosen, self._loads(worker, replies[worker]), strict=True))
         return [answers[index] for index in indices]
 
     def close(self) -> None:
@@ -587,55 +629,143 @@ class WorkerPool:
         """Return the process ids of the workers that have not been ended."""
         return [process.pid for process in self._processes if process.pid is not None]
 
-    def _start(self, factories: Sequence[EnvFactory], start_method: StartMethod) -> None:
-        context: Any = multiprocessing.get_context(start_method)
+    def _start(self) -> None:
         with _hidden_main(), _single_threaded():
-            for number, chunk in enumerate(self._chunks):
-                ours, theirs = context.Pipe()
-                line = _Line(ours, context.Semaphore(0), context.Semaphore(0), context.RawArray("B", 2))
-                # A forked child holds copies of the pipes before it and would keep them open after the parent
-                # died.
-                stale = [line.conn for line in self._lines] + [ours] if start_method == "fork" else []
+            for worker in range(len(self._chunks)):
+                try:
+                    line, process = self._start_one(worker)
+                except (OSError, EOFError) as error:
+                    raise ConfigError(self._not_started(worker, error)) from error
                 self._lines.append(line)
-                envs = TaskEnvs(factories[chunk.start : chunk.stop], self._tasks[chunk.start : chunk.stop])
-                process = context.Process(
-                    target=_work,
-                    args=(replace(line, conn=theirs), stale, envs),
-                    name=f"sb3_ars-envs-{number}",
-                    daemon=True,
-                )
-                process.start()
                 self._processes.append(process)
-                # Else a dead worker's pipe would never reach its end here.
-                theirs.close()
+
+    def _start_one(self, worker: int) -> tuple[_Line, BaseProcess]:
+        chunk, context = self._chunks[worker], self._context
+        ours, theirs = context.Pipe()
+        line = _Line(ours, context.Semaphore(0), context.Semaphore(0), context.RawArray("B", 2))
+        # A forked child holds copies of the other pipes and would keep them open after the parent died.
+        stale = [line.conn for line in self._lines] + [ours] if context.get_start_method() == "fork" else []
+        # The factories follow through our own pipe: a child that dies before it has read what it is started
+        # with would let multiprocessing wait for ever, once that is longer than a pipe holds.
+        envs = TaskEnvs((), self._tasks[chunk.start : chunk.stop])
+        process = context.Process(
+            target=_work,
+            args=(replace(line, conn=theirs), stale, envs),
+            name=f"sb3_ars-envs-{worker}",
+            daemon=True,
+        )
+        process.start()
+        # Else a dead worker's pipe would never reach its end here.
+        theirs.close()
+        return line, process
+
+    def _not_started(self, worker: int, error: OSError | EOFError) -> str:
+        return (
+            f"{self._name(worker)} could not be started ({error or type(error).__name__}). {_remedy(error)}"
+        )
+
+    @contextlib.contextmanager
+    def _losing(self) -> Iterator[None]:
+        """Let workers that fail meanwhile be lost, where they may be started anew."""
+        self._may_lose = self.restarts is not None
+        try:
+            yield
+        finally:
+            self._may_lose = False
+            self._lost.clear()
+
+    def _lose(self, workers: Sequence[int], message: str) -> None:
+        """Note that workers failed, and why; end all and raise where none may be started anew."""
+        if not self._may_lose:
+            self._fail(message)
+        for worker in workers:
+            self._lost[worker] = message
+            self._awaiting.discard(worker)
+            self._replies.pop(worker, None)
+
+    def _start_lost_anew(self, options: Sequence[Mapping[str, Any]]) -> list[int]:
+        """Put new processes in the place of lost ones; their replies are then those of a reset.
+
+        :param options: of the reset, one per env
+        :return: which workers are new
+        """
+        said, anew = [], set()
+        while self._lost and self.restarts is not None:
+            worker, reason = min(self._lost.items())
+            del self._lost[worker]
+            number = self.restarts.count(worker)
+            if not number:
+                self._fail(
+                    f"{reason} It was started anew {MAX_IN_A_ROW} times in a row, and no step worked since."
+                )
+            said.append(
+                f"{reason} {self._name(worker)} was started anew, restart {number} of this worker: the running "
+                "episodes of its envs end as truncated, and what their actions led to is not learned."
+            )
+            anew.add(worker)
+            c = self._chunks[worker]
+            self._start_anew(worker, (self.restarts.seeds(worker), options[c.start : c.stop]))
+        for message in said:
+            warnings.warn(message, stacklevel=4)
+        return sorted(anew)
+
+    def _start_anew(self, worker: int, reset: tuple[Any, ...]) -> None:
+        """Replace a worker's process, and build and reset its envs; if that fails it is lost once more."""
+        _end_workers([self._processes[worker]], [self._lines[worker]], self._owner, grace=1.0)
+        try:
+            with _hidden_main(), _single_threaded():
+                self._lines[worker], self._processes[worker] = self._start_one(worker)
+        except (OSError, EOFError) as error:
+            self._lose([worker], self._not_started(worker, error))
+            return
+        c = self._chunks[worker]
+        for doing, message in (
+            ("building its envs anew", ("build", (self._factories[c.start : c.stop],))),
+            ("attaching memory", ("attach", (self._memory, self._layout, c.start, c.stop))),
+            ("resetting its envs", ("reset", reset)),
+        ):
+            self._replies.pop(worker, None)
+            patience = max(START_TIMEOUT, self._timeout) if message[0] == "build" else self._timeout
+            self._send(worker, message, patience)
+            self._collect(patience, doing)
+            if worker in self._lost:
+                return
 
     def _command(self, messages: Sequence[tuple[str, tuple[Any, ...]]], doing: str) -> None:
         self._send_all(messages)
         self._collect(self._timeout, doing)
 
-    def _send_all(self, messages: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
+    def _send_all(
+        self, messages: Sequence[tuple[str, tuple[Any, ...]]], patience: float | None = None
+    ) -> None:
         self._settle()
         for worker, message in enumerate(messages):
-            self._send(worker, message)
+            self._send(worker, message, patience)
 
     def _settle(self) -> None:
         """Throw away answers of a command that was interrupted (Ctrl-C) between sending and receiving."""
+        self._check_owner()
         if self._awaiting:
             self._collect(self._timeout, "finishing an interrupted command", fatal=False)
         self._replies.clear()
 
-    def _send(self, worker: int, message: tuple[str, tuple[Any, ...]]) -> None:
+    def _send(self, worker: int, message: tuple[str, tuple[Any, ...]], patience: float | None = None) -> None:
         line, data = self._lines[worker], _dumps(message)
         # In this order, because a long message is taken only while it is read.
         line.ask(_COMMAND)
-        try:
-            line.conn.send_bytes(data)
-        except OSError:
-            self._fail_dead(worker, "before it could be asked")
         self._awaiting.add(worker)
+        seconds = self._timeout if patience is None else patience
+        try:
+            _limit_waiting(line.conn, seconds)
+            line.conn.send_bytes(data)
+        except BlockingIOError:
+            self._lose_hung(seconds, f"being sent {message[0]!r}", [worker])
+        except OSError:
+            self._lose_dead(worker, "before it could be asked")
 
     def _collect(self, timeout: float, doing: str, fatal: bool = True) -> None:
-        deadline = time.monotonic() + timeout
+        self._check_owner()
+        begin = time.monotonic()
         while self._awaiting:
             first, *others = sorted(self._awaiting)
             if self._lines[first].done.acquire(timeout=_LOOK_AROUND):
@@ -646,33 +776,60 @@ class WorkerPool:
                 if self._lines[worker].done.acquire(block=False):
                     self._receive(worker, doing, fatal)
                 elif worker in dead:
-                    self._fail_dead(worker, f"while {doing}")
-            if self._awaiting and time.monotonic() > deadline:
-                self._fail_hung(timeout, doing)
+                    self._lose_dead(worker, f"while {doing}")
+            waited = time.monotonic() - begin
+            # building may take longer than a step, but not while the process is stopped
+            hung = sorted(self._awaiting) if waited > timeout else []
+            hung = hung or (self._stopped() if waited > self._timeout else [])
+            if hung:
+                self._lose_hung(min(waited, timeout), doing, hung)
+
+    def _stopped(self) -> list[int]:
+        """Return which of the awaited workers a signal has stopped, so that they cannot answer."""
+        return [worker for worker in sorted(self._awaiting) if _is_stopped(self._processes[worker])]
+
+    def _check_owner(self) -> None:
+        if os.getpid() != self._owner:
+            tasks = ", ".join(map(repr, dict.fromkeys(self._tasks)))
+            raise WorkerError(
+                f"The env workers of {tasks} belong to process {self._owner}, of which this one is a fork: they cannot "
+                "serve two. Build the env anew in this process."
+            )
 
     def _receive(self, worker: int, doing: str, fatal: bool) -> None:
         line = self._lines[worker]
         if line.words[_ANSWER] == _REPLY:
             try:
                 if not line.conn.poll(self._timeout):  # stopped between its wake-up and its message
-                    self._fail_hung(self._timeout, doing)
+                    raise BlockingIOError
                 self._replies[worker] = line.conn.recv_bytes()
+            except BlockingIOError:  # stopped in the middle of its message
+                self._lose_hung(self._timeout, doing, [worker])
             except (EOFError, OSError):
-                self._fail_dead(worker, f"while {doing}")
+                self._lose_dead(worker, f"while {doing}")
         self._awaiting.discard(worker)
         if fatal and self._replies.get(worker, b"")[:1] == _ERROR:
-            self._fail_raised(self._replies[worker], doing)
+            self._lose_raising(worker, self._replies[worker], doing)
 
     def _take_lists(self) -> list[Any]:
-        parts = [pickle.loads(self._replies.pop(worker)[1:]) for worker in range(len(self._chunks))]
+        parts = [self._loads(worker, self._replies.pop(worker)) for worker in range(len(self._chunks))]
         return [item for part in parts for item in part]
+
+    def _loads(self, worker: int, reply: bytes) -> Any:
+        try:
+            return pickle.loads(reply[1:])
+        except Exception as error:
+            self._fail(
+                f"{self._name(worker)} sent an info or an answer that cannot be read outside its process "
+                f"({type(error).__name__}: {error}). Use plain numbers, strings and arrays in it, or n_workers=0."
+            )
 
     def _name(self, worker: int) -> str:
         chunk = self._chunks[worker]
         tasks = dict.fromkeys(self._tasks[chunk.start : chunk.stop])
         return f"Env worker {worker} (task{'s' * (len(tasks) > 1)} {', '.join(map(repr, tasks))})"
 
-    def _fail_dead(self, worker: int, when: str) -> NoReturn:
+    def _lose_dead(self, worker: int, when: str) -> None:
         process = self._processes[worker]
         process.join(1.0)
         code = process.exitcode
@@ -681,22 +838,32 @@ class WorkerPool:
             if code is not None and code < 0
             else f"exited with {code}"
         )
-        hint = (
-            " Out of memory is the usual reason for SIGKILL: use fewer envs or workers." if code == -9 else ""
-        )
-        self._fail(
-            f"{self._name(worker)} {how} {when}.{hint} Its last words, if any, are on the error output."
-        )
-
-    def _fail_hung(self, timeout: float, doing: str) -> NoReturn:
-        names = "; ".join(self._name(worker) for worker in sorted(self._awaiting))
-        self._fail(
-            f"{names} did not answer within {timeout:g} s while {doing}. "
-            "If the env is only slow, raise worker_timeout; if it hangs, try n_workers=0 to see where."
+        hint = {
+            -signal.SIGKILL: " Out of memory is the usual reason for SIGKILL: use fewer envs or workers.",
+            # Python's multiprocessing then ends what it takes for children of its own
+            -signal.SIGTERM: " So it is when a child of os.fork() ends, unless by os._exit().",
+        }.get(code or 0, "")
+        self._lose(
+            [worker],
+            f"{self._name(worker)} {how} {when}.{hint} Its last words, if any, are on the error output.",
         )
 
-    def _fail_raised(self, reply: bytes, doing: str) -> NoReturn:
+    def _lose_hung(self, timeout: float, doing: str, workers: Sequence[int]) -> None:
+        names = "; ".join(self._name(worker) for worker in workers)
+        stopped = any(_is_stopped(self._processes[worker]) for worker in workers)
+        why = (
+            "A signal has stopped it (SIGSTOP, or Ctrl-Z in its terminal)."
+            if stopped
+            else "If the env is only slow, raise worker_timeout; if it hangs, try n_workers=0 to see where."
+        )
+        self._lose(workers, f"{names} did not answer within {timeout:g} s while {doing}. {why}")
+
+    def _lose_raising(self, worker: int, reply: bytes, doing: str) -> None:
         task, trace, error = _read_error(reply)
+        if self._may_lose and not isinstance(error, EnvContractError):
+            last = trace.strip().splitlines()[-1]
+            self._lose([worker], f"The env of task {task!r} raised {last!r} while {doing}.")
+            return
         self.close()
         if isinstance(error, ConfigError | EnvContractError):
             raise error from WorkerError(f"in the worker:\n\n{trace}")
@@ -862,18 +1029,50 @@ def _next_question(line: _Line) -> int:
 
 def _answer(envs: TaskEnvs, message: bytes | None) -> bytes:
     """Return what is to be told beyond the arrays, nothing after most steps; a step has no message."""
+    # BaseException: an env that calls sys.exit() would end the worker with status 0 and without a word.
     try:
         if message is None:
             ended = envs.step_wait()
-            return _RESULT + _dumps(ended) if ended else b""
+            return _pack(envs, "step", ended) if ended else b""
         method, args = pickle.loads(message)
-        return _RESULT + _dumps(getattr(envs, method)(*args))
-    except Exception as error:
+        return _pack(envs, method, getattr(envs, method)(*args))
+    except BaseException as error:
         return _ERROR + _dumps((envs.blame(), traceback.format_exc(), _portable(error)))
 
 
-def _portable(error: Exception) -> bytes | None:
-    """Return the exception pickled, or None if it does not survive the journey."""
+def _pack(envs: TaskEnvs, method: str, answer: Any) -> bytes:
+    """Return an answer as bytes.
+
+    :raises EnvContractError: naming the task and the entry, for an info that cannot be pickled
+    """
+    try:
+        return _RESULT + _dumps(answer)
+    except Exception as error:
+        for index, item in enumerate(answer if method in ("step", "reset") else ()):
+            envs.current, infos = (item.env, item[1:]) if isinstance(item, Ended) else (index, (item,))
+            entries = [(key, value) for info in infos for key, value in info.items()]
+            for key, value in entries:
+                if _is_portable(value):
+                    continue
+                raise EnvContractError(
+                    f"Task {envs.blame()!r}: info[{key!r}] of its {method}() is of type {type(value).__name__}, which "
+                    f"cannot be sent from a worker process ({error}). Leave it out of the info, or use n_workers=0."
+                ) from error
+        raise
+
+
+def _is_portable(value: Any) -> bool:
+    try:
+        _dumps(value)
+    except Exception:
+        return False
+    return True
+
+
+def _portable(error: BaseException) -> bytes | None:
+    """Return the exception pickled; None if it does not survive the journey, or would end the process it arrives in."""
+    if not isinstance(error, Exception):
+        return None
     try:
         data = _dumps(error)
         pickle.loads(data)
@@ -890,21 +1089,95 @@ def _read_error(reply: bytes) -> tuple[str, str, Exception | None]:
         return task, trace, None
 
 
+def _shared_file(size: int) -> Any:
+    """Return an open file of zeros that processes can map by its name: in memory where there is room, else on disk.
+
+    :param size: bytes
+    :raises ConfigError: if there is room nowhere
+    """
+    said: list[OSError] = []
+    for folder in ("/dev/shm", None):
+        try:
+            file = tempfile.NamedTemporaryFile(prefix="sb3_ars_", dir=folder)  # the caller closes it
+        except OSError as error:
+            said.append(error)
+            continue
+        # Written, not only made as long: whoever touches a mapped page that finds no room is killed by SIGBUS.
+        try:
+            file.write(bytes(size))
+            file.flush()
+            return file
+        except OSError as error:
+            said.append(error)
+            with contextlib.suppress(OSError):  # it tries to write once more
+                file.close()
+    raise ConfigError(
+        f"The {size:,} bytes that workers share find room neither in /dev/shm ({said[0]}) nor in the folder for "
+        f"temporary files ({said[1]}). {_remedy(said[0])}"
+    ) from said[0]
+
+
+def _remedy(error: OSError | EOFError) -> str:
+    """Return what to do about an error of the system while workers start."""
+    code = getattr(error, "errno", None)
+    if code in (errno.EMFILE, errno.ENFILE):
+        return "Let this process open more files (ulimit -n), or use fewer workers (n_workers)."
+    if code in (errno.EAGAIN, errno.ENOMEM):
+        return (
+            "The limit on processes (ulimit -u, a container's --pids-limit) or the memory is used up: raise it, or "
+            "use fewer workers (n_workers)."
+        )
+    if code in (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM):
+        return (
+            "Processes meet through /dev/shm, which must be writable and have room: start a container with "
+            "--shm-size=256m, or use n_workers=0."
+        )
+    return "Use n_workers=0 to step the envs in this process."
+
+
+def _limit_waiting(conn: Connection, seconds: float) -> None:
+    """Let a message to or from a process that is stopped in the middle of it fail with BlockingIOError.
+
+    A Connection has no timeout of its own, but its socket has.
+    """
+    span = struct.pack("@ll", int(seconds), int(seconds % 1 * 1e6))
+    end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM, fileno=os.dup(conn.fileno()))
+    with end:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, span)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, span)
+    os.set_blocking(conn.fileno(), True)  # the wrapper may have changed it: socket.setdefaulttimeout()
+
+
+def _is_stopped(process: BaseProcess) -> bool:
+    try:
+        return bool(psutil.Process(process.pid).status() == psutil.STATUS_STOPPED)
+    except psutil.Error:
+        return False
+
+
 def _end_workers(processes: list[BaseProcess], lines: list[_Line], owner: int, grace: float = 3.0) -> None:
     if os.getpid() != owner:  # a forked copy of the parent must not end the parent's workers
         return
     for line in lines:
         line.ask(_CLOSE)
         line.conn.close()
+    for process in processes:  # a stopped one can neither close its envs nor be terminated
+        _wake(process)
     _join(processes, grace)
     for process in processes:
         process.terminate()
+        _wake(process)
     _join(processes, 1.0)
     for process in processes:
         process.kill()
     _join(processes, 1.0)
     processes.clear()
     lines.clear()
+
+
+def _wake(process: BaseProcess) -> None:
+    if process.pid is not None and _is_stopped(process):
+        os.kill(process.pid, signal.SIGCONT)
 
 
 def _join(processes: Sequence[BaseProcess], seconds: float) -> None:

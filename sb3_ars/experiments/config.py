@@ -50,6 +50,7 @@ NO_PART_OF_A_METHOD = (
     "verbose",
     "profile",
     "env.n_workers",
+    "env.restart_workers",
     "evaluation.every",
     "checkpoint.every",
     "checkpoint.every_minutes",
@@ -73,6 +74,8 @@ class EnvConfig:
     """Horizon in steps."""
     n_workers: int | Literal["auto"] = "auto"
     """Worker processes; 0 steps in this process."""
+    restart_workers: bool = False
+    """Start a worker anew that dies or hangs, or whose environment raises, instead of ending the run."""
 
     @property
     def is_toy(self) -> bool:

@@ -22,7 +22,7 @@ from typing import Any, Literal, Protocol
 from sb3_ars.errors import ConfigError, check_count
 from sb3_ars.experiments import cells as disk
 from sb3_ars.experiments.cells import Cell
-from sb3_ars.versions import available_cpus
+from sb3_ars.machine import available_cpus
 
 __all__ = ["Launcher", "LocalLauncher", "Monitor", "Outcome", "RayLauncher"]
 

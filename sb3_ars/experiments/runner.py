@@ -232,6 +232,7 @@ def make_env(config: RunConfig) -> VecEnv:
         "n_envs_per_task": env.n_envs_per_task,
         "max_episode_steps": env.max_episode_steps,
         "n_workers": env.n_workers,
+        "restart_workers": env.restart_workers,
     }
     if env.is_toy:
         return make_toy_env(tasks=env.task_names, **common)
