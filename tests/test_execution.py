@@ -1,6 +1,7 @@
 """How updates are executed changes nothing but rounding: fused, bfloat16, compiled, overlapped."""
 
 import contextlib
+import dataclasses
 import itertools
 import warnings
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 from sb3_ars import ARSSAC, ARSTQC, ConfigError, WorkerError, make_multitask_env, make_toy_env
@@ -289,17 +291,82 @@ def test_overlap_does_a_rollouts_updates(gradient_steps, train_freq, per_rollout
 # ---------------------------------------------------------------------- on a GPU, as far as it goes without one
 
 
-def test_the_captured_actor_computes_what_the_policy_does(monkeypatch):
+@pytest.fixture
+def without_a_gpu(monkeypatch):
+    """Let what is captured run at once; the list says what was waited for."""
+    events = []
+    event = SimpleNamespace(
+        record=lambda: events.append("chosen"), synchronize=lambda: events.append("actions")
+    )
+    monkeypatch.setattr(th.cuda, "Event", lambda: event)
+    monkeypatch.setattr(CapturedCalls, "__call__", lambda self, function, *args, **kwargs: function())
+    return events
+
+
+def test_the_captured_actor_computes_what_the_policy_does(without_a_gpu):
     model = make()
     actor = CapturedActor(model.actor, (4, 10, 2), th.device("cpu"))
-    monkeypatch.setattr(
-        th.cuda, "current_stream", lambda: type("Stream", (), {"synchronize": lambda self: None})()
-    )
-    actor._calls = lambda function, variant: function()
     obs = model.env.reset()
     assert np.allclose(actor(obs, deterministic=True), model.predict(obs, deterministic=True)[0], atol=1e-6)
     sampled = [actor(obs, deterministic=False) for _ in range(2)]
     assert not np.allclose(*sampled) and np.abs(sampled).max() <= 1
+
+
+def captured(**options):
+    model = make(overlap=True, **options)
+    model._plan = dataclasses.replace(model._plan, execution="cudagraph")
+    return model
+
+
+def test_a_captured_update_is_queued_before_the_actions_are_awaited(without_a_gpu, monkeypatch):
+    model, events = captured(train_freq=2), without_a_gpu
+
+    def note(target, name, event):
+        original = getattr(target, name)
+        monkeypatch.setattr(target, name, lambda *a, **k: (events.append(event), original(*a, **k))[1])
+
+    note(model.env, "step_async", "send")
+    note(model.env, "step_wait", "wait")
+    note(model, "_sample_and_update", "update")
+    model.learn(600)
+    step = ["chosen", "actions", "send", "wait"]
+    at = events.index("update") - 1
+    assert events[at : at + 18] == [step[0], "update", *step[1:], *step] * 2
+
+
+def test_when_a_captured_update_is_queued_changes_no_bit(without_a_gpu, monkeypatch):
+    early = captured().learn(600)
+    choose = CapturedActor.__call__
+    monkeypatch.setattr(CapturedActor, "__call__", lambda self, obs, how, _: choose(self, obs, how))
+    late = captured().learn(600)
+    assert early._n_updates == late._n_updates > 50
+    assert th.equal(parameters(early), parameters(late))
+
+
+def test_predictions_outside_a_rollout_queue_no_update(without_a_gpu):
+    class Predict(BaseCallback):
+        def _on_rollout_start(self):
+            n_updates = self.model._n_updates
+            self.model.predict(self.model._last_obs)
+            assert self.model._n_updates == n_updates
+
+        def _on_step(self):
+            return True
+
+    model = captured().learn(600, callback=Predict())
+    assert model._n_updates > 50
+
+
+def test_a_failing_captured_update_leaves_no_step_under_way(without_a_gpu):
+    model = captured()
+
+    def fail(*args):
+        raise RuntimeError("the update failed")
+
+    model._sample_and_update = fail
+    with pytest.raises(RuntimeError, match="the update failed"):
+        model.learn(600)
+    assert model.env.reset().shape == (4, 10)
 
 
 class RecordedGraph:

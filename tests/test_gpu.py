@@ -6,6 +6,7 @@ import pytest
 import torch as th
 
 from sb3_ars import ARSSAC, ARSTQC, make_toy_env
+from sb3_ars.algorithms.execution import CapturedActor
 from sb3_ars.core.update import Noise
 
 pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:.*leaves no updates")]
@@ -165,6 +166,15 @@ def test_overlap_on_cuda_is_the_default_and_deterministic(execution):
     assert trained(steps=400, n_reset=0, overlap=None)._plan.overlap
     runs = [trained(execution=execution, overlap=True) for _ in range(2)]
     for a, b in zip(*(run.policy.parameters() for run in runs), strict=True):
+        assert th.equal(a, b)
+
+
+def test_when_a_captured_update_is_queued_changes_no_bit_on_cuda(monkeypatch):
+    early = trained(execution="cudagraph", overlap=True)
+    choose = CapturedActor.__call__
+    monkeypatch.setattr(CapturedActor, "__call__", lambda self, obs, how, _: choose(self, obs, how))
+    late = trained(execution="cudagraph", overlap=True)
+    for a, b in zip(early.policy.parameters(), late.policy.parameters(), strict=True):
         assert th.equal(a, b)
 
 

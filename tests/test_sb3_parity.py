@@ -1,5 +1,7 @@
 """ARSSAC beside SB3's SAC, and ARSTQC beside sb3-contrib's TQC: the same seed and options give the same bits."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -278,6 +280,57 @@ def test_training_updates_running_statistics_and_prediction_does_not(algorithm):
     for net in ("actor", "critic"):
         key = f"{net}.features_extractor.body.1.running_mean"
         assert not th.equal(before[key], after[key])
+
+
+class KeptInEvaluation(nn.BatchNorm1d):
+    """A layer whose statistics are frozen in the usual way."""
+
+    def train(self, mode=True):
+        return super().train(False)
+
+
+class OwnModes(NormedFeatures):
+    """Modules that answer train() each in a way of its own."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, dropout=0.5)
+        frozen = nn.BatchNorm1d(6)
+        frozen.train = lambda mode=True: frozen
+        self.body.extend([nn.Sequential(KeptInEvaluation(6), nn.Dropout()), frozen, nn.Sequential()])
+        self.twice = self.body[0]
+        self.none = None
+        self.register_module("missing", None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's about torch.jit
+            self.scripted = th.jit.script(nn.Sequential(nn.Linear(1, 1), nn.Dropout()))
+
+
+def modes(model):
+    return {name: module.training for name, module in model.policy.named_modules()}
+
+
+@pytest.mark.parametrize(("ours", "theirs"), PAIRS)
+def test_every_module_is_in_the_mode_that_sb3_puts_it_in(ours, theirs):
+    kwargs = SMALL | {"features_extractor_class": OwnModes}
+    mine, other = (make(algorithm, drift(), policy_kwargs=kwargs) for algorithm in (ours, theirs))
+    for mode in (True, True, False, False, True):
+        for model in (mine, other):
+            model.policy.set_training_mode(mode)
+        # our layers stand in the place of SB3's, so the names are the same
+        assert modes(mine) == modes(other)
+        assert modes(mine)["actor.features_extractor.body.2"] == modes(mine)["critic"] == mode
+        assert not modes(mine)["actor.features_extractor.body.3.0"] and not modes(mine)["critic_target"]
+        dropped_out = mine.actor.features_extractor.scripted(th.ones(64, 1)) == 0
+        assert dropped_out.any() == mode
+
+
+def test_modules_put_in_between_two_calls_follow_the_next_one():
+    model = make(ARSSAC, drift())
+    for mode in (False, False, True, True):
+        model.policy.set_training_mode(mode)
+        model.actor.latent_pi[0] = nn.Sequential(nn.Dropout(), model.actor.latent_pi[0]).train(not mode)
+        model.policy.set_training_mode(mode)
+        assert {module.training for net in (model.actor, model.critic) for module in net.modules()} == {mode}
 
 
 @pytest.mark.parametrize(("ours", "theirs"), PAIRS)

@@ -98,7 +98,7 @@ def _plus_one(x: th.Tensor) -> th.Tensor:
 
 
 class CapturedActor:
-    """Samples actions on CUDA: one captured graph with one copy each way, and one wait, for the actions.
+    """Samples actions on CUDA: one captured graph with one copy each way, and one wait, for the actions alone.
 
     :param actor: the policy's actor
     :param shape: rows, width of an observation, width of an action
@@ -113,17 +113,24 @@ class CapturedActor:
         self._obs = th.empty((n_envs, obs_dim), device=device)
         self._noise = th.empty((n_envs, action_dim), device=device)
         self._host_actions = th.empty((n_envs, action_dim), pin_memory=pinned)
+        self._acted = th.cuda.Event()  # type: ignore[no-untyped-call]  # torch's
         self._calls: CapturedCalls[None] = CapturedCalls()
 
-    def __call__(self, obs: np.ndarray, deterministic: bool) -> np.ndarray:
+    def __call__(
+        self, obs: np.ndarray, deterministic: bool, meanwhile: Callable[[], None] | None = None
+    ) -> np.ndarray:
         """Return actions in [-1, 1], ``(n_envs, action_dim)`` float32.
 
         :param obs: ``(n_envs, obs_dim)``
         :param deterministic: means instead of samples
+        :param meanwhile: gives the device more to do, which it does after choosing actions and nobody waits for
         """
         self._host_obs.copy_(th.from_numpy(np.ascontiguousarray(obs)))
         self._calls(partial(self._forward, deterministic), variant=deterministic)
-        th.cuda.current_stream().synchronize()
+        self._acted.record()
+        if meanwhile is not None:
+            meanwhile()
+        self._acted.synchronize()
         actions: np.ndarray = self._host_actions.numpy().copy()
         return actions
 
@@ -139,13 +146,15 @@ class CapturedActor:
 class WorkWhileStepping(VecEnvWrapper):
     """An environment whose next ``step`` does some work between sending the actions and awaiting the outcome.
 
+    Work that a GPU does by itself is better begun before: see :meth:`do_work`.
+
     :param venv: the environment
     """
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
         self.work: Callable[[], None] | None = None
-        """Done once, in the next step; if it raises, the step is finished first."""
+        """Done once, at the latest in the next step; if it raises there, the step is finished first."""
         self.timer: Timer = nullcontext
 
     def reset(self) -> Any:
@@ -157,12 +166,16 @@ class WorkWhileStepping(VecEnvWrapper):
         with self.timer("step"):
             self.venv.step_async(actions)
 
-    def step_wait(self) -> VecEnvStepReturn:
-        """Do the work, then return what the step gave."""
+    def do_work(self) -> None:
+        """Do the work now, unless it is done."""
         work, self.work = self.work, None
+        if work is not None:
+            work()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Do the work unless it is done, then return what the step gave."""
         try:
-            if work is not None:
-                work()
+            self.do_work()
         finally:
             with self.timer("step"):
                 outcome = self.venv.step_wait()

@@ -1073,13 +1073,20 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         return super().predict(observation, state, episode_start, deterministic)
 
     def _predict_captured(self, observation: Any, deterministic: bool) -> np.ndarray:
-        """Return actions for one observation of each environment through the captured actor."""
+        """Return actions for one observation of each environment through the captured actor.
+
+        In a rollout the updates that overlap with its first step are queued before the actions are awaited: the device
+        would have nothing to do while they are sent to the environments.
+        """
         if self._captured_actor is None:
             shape = (*observation.shape, *(self.action_space.shape or ()))
             self._captured_actor = CapturedActor(self.actor, shape, self.device)
         self.policy.set_training_mode(False)
+        meanwhile = (
+            self._stepping_env.do_work if self._is_stepping and self._stepping_env is not None else None
+        )
         with tf32(self._plan.tf32):
-            return self.policy.unscale_action(self._captured_actor(observation, deterministic))
+            return self.policy.unscale_action(self._captured_actor(observation, deterministic, meanwhile))
 
     def set_parameters(
         self,
