@@ -4,8 +4,9 @@ import pickle
 
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_ars import ARSSAC, ARSTQC, make_toy_env
+from sb3_ars import ARSSAC, ARSTQC, RunCheckpoint, make_toy_env
 from sb3_ars.algorithms.execution import CapturedActor
 from sb3_ars.core.update import Noise
 
@@ -56,7 +57,7 @@ def test_an_update_on_cuda_is_the_update_on_the_cpu_up_to_rounding():
         assert th.allclose(a, b.cpu(), atol=1e-4)
 
 
-def trained(algorithm=ARSSAC, steps=1200, layer_norm=False, **options):
+def untrained(algorithm=ARSSAC, layer_norm=False, **options):
     options = {
         "n_reset": 2,
         "learning_starts": 200,
@@ -66,7 +67,11 @@ def trained(algorithm=ARSSAC, steps=1200, layer_norm=False, **options):
         **options,
     }
     options["policy_kwargs"] = {"net_arch": [32, 32], "critic_layer_norm": layer_norm}
-    return algorithm("MlpPolicy", make_toy_env(seed=0), device="cuda", **options).learn(steps)
+    return algorithm("MlpPolicy", make_toy_env(seed=0), device="cuda", **options)
+
+
+def trained(algorithm=ARSSAC, steps=1200, layer_norm=False, **options):
+    return untrained(algorithm, layer_norm, **options).learn(steps)
 
 
 def replayed(execution, n_updates, algorithm=ARSSAC, layer_norm=False, precision="fp32"):
@@ -198,3 +203,24 @@ def test_a_buffer_pickled_on_cuda_draws_the_same_rows_again():
     copy = pickle.loads(pickle.dumps(model.replay_buffer))
     copy.device = "cuda"
     assert th.equal(copy.draw_slots(8), model.replay_buffer.draw_slots(8))
+
+
+@pytest.mark.parametrize("execution", ["eager", "cudagraph"])
+@pytest.mark.parametrize("overlap", [False, True])
+def test_a_resumed_run_on_cuda_is_the_whole_run(execution, overlap, tmp_path):
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.num_timesteps < 1003
+
+    options = {"execution": execution, "overlap": overlap}
+    whole = trained(**options)
+    untrained(**options).learn(
+        1200, callback=[RunCheckpoint(tmp_path, every=100, every_minutes=None), Stop()]
+    )
+    th.cuda.manual_seed(9)
+    resumed = ARSSAC.resume(tmp_path, make_toy_env(seed=0), device="cuda")
+    assert resumed.num_timesteps == 1000
+    resumed.learn(resumed.remaining_timesteps, reset_num_timesteps=False)
+    for a, b in zip(whole.policy.parameters(), resumed.policy.parameters(), strict=True):
+        assert th.equal(a, b)
+    assert th.equal(whole.replay_buffer.sample(16).rewards, resumed.replay_buffer.sample(16).rewards)
