@@ -1,6 +1,7 @@
 """The documents: the site builds, every command and every Python example in them runs, with smaller numbers."""
 
 import configparser
+import functools
 import os
 import re
 import shlex
@@ -131,7 +132,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(
         MultiTaskOffPolicyAlgorithm,
         "__init__",
-        lambda self, *args, **given: init(self, *args, **{**given, **few}),
+        functools.wraps(init)(lambda self, *args, **given: init(self, *args, **{**given, **few})),
     )
     monkeypatch.chdir(tmp_path)
     Path("tiny.yaml").write_text(yaml.safe_dump(tiny_scale()))
@@ -286,6 +287,7 @@ SMALLER = [
     (r"param_resets=\[[\d_]+\]", "param_resets=[100]"),
     (r"n_seeds=2", "n_seeds=1"),
     (r"n_trials=10", "n_trials=1"),
+    (r"every=1000", "every=60"),
     (r'scale="toy"', 'scale="tiny.yaml"'),
     # what a run this short cannot wait for
     (r'"rank": 8', '"rank": 8, "min_success": 0'),

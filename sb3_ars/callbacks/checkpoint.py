@@ -70,7 +70,7 @@ class RunCheckpoint(BaseCallback):
         self.every, self.every_minutes, self.handle_signals = every, every_minutes, handle_signals
         self.notes, self.files = dict(notes or {}), [Path(file) for file in files]
         self.seconds = 0.0
-        """Time spent in training, of what a run was resumed from too."""
+        """Time spent in training, written into each manifest; set it to go on counting after a resume."""
         self._folder = CheckpointFolder(self.folder, check_count("keep", keep))
         self._told: signal.Signals | None = None
         self._next_step: float = 0
@@ -101,18 +101,6 @@ class RunCheckpoint(BaseCallback):
             raise ConfigError(
                 f"The folder of checkpoints {self.folder} cannot be made ({error.strerror}); choose another."
             ) from error
-
-    def checkpoint_state(self) -> dict[str, Any]:
-        """Return what it remembers, for a checkpoint of the run."""
-        self._count_seconds()
-        return {"seconds": self.seconds}
-
-    def restore_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `checkpoint_state` returned.
-
-        :param state: see there
-        """
-        self.seconds = state["seconds"]
 
     def _count_seconds(self) -> None:
         now = time.monotonic()
@@ -145,8 +133,10 @@ class RunCheckpoint(BaseCallback):
     def _write(self) -> None:
         started = time.monotonic()
         try:
+            self._count_seconds()
+            notes = {**self.notes, "seconds": self.seconds}
             path = write_checkpoint(
-                self.algorithm, self._folder, self.locals.get("callback"), self.notes, self.files
+                self.algorithm, self._folder, self.locals.get("callback"), notes, self.files
             )
         except OSError as error:
             last = self.algorithm.last_checkpoint

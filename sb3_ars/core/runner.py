@@ -61,6 +61,10 @@ class CapturedCalls(Generic[Result]):
         th.cuda.synchronize()
         with th.cuda.graph(graph):
             result = function()
+        # Beginning a capture sets the generators' offset on the device to 0, on the capture's own stream (torch 2.11,
+        # CUDAGeneratorImpl.cpp). On a busy GPU that came after what the replay sets here, so that the first replay drew
+        # random numbers anew: one in two runs differed.
+        th.cuda.synchronize()
         self._captured[variant] = graph, result
         graph.replay()
         return result

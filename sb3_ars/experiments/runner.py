@@ -159,6 +159,7 @@ def _run(
             notes={"name": name},
             files=[folder / PROGRESS],
         )
+        checkpoints.seconds = 0.0 if checkpoint is None else float(checkpoint.notes["seconds"])
         interrupted = _learn(
             model, config, evaluation_env, protocol, folder, checkpoints, progress_bar, after_evaluation
         )
