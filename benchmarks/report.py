@@ -20,11 +20,11 @@ from benchmarks import memory, methods
 from benchmarks.harness import RESULTS, ROOT, markdown_table
 from benchmarks.toy_methods import ARMS, summary
 
-PERFORMANCE, METHODS_PAGE, TUNING = (
-    ROOT / "docs" / f"{name}.md" for name in ("performance", "methods", "tuning")
+PERFORMANCE, METHODS_PAGE, TUNING, CHECKPOINTS = (
+    ROOT / "docs" / f"{name}.md" for name in ("performance", "methods", "tuning", "checkpoints")
 )
 METHOD_PAGES = METHODS_PAGE.with_suffix("")  # a folder
-PAGES = (PERFORMANCE, METHODS_PAGE, TUNING, *sorted(METHOD_PAGES.glob("*.md")))
+PAGES = (PERFORMANCE, METHODS_PAGE, TUNING, CHECKPOINTS, *sorted(METHOD_PAGES.glob("*.md")))
 CHART = "performance.png"
 UNMEASURED = "Not measured yet."
 _BLOCK = re.compile(r"(<!-- begin: (?P<name>[\w-]+) -->\n).*?(<!-- end: (?P=name) -->)", re.DOTALL)
@@ -208,11 +208,11 @@ PANELS: dict[str, Callable[[dict[str, Any]], list[Panel]]] = {
 def render(name: str, results: Results) -> str:
     """Return the text of a block.
 
-    :param name: of ``BLOCKS``, ``METHOD_BLOCKS`` or ``TUNING_BLOCKS``, a benchmark's, or "toy-" or "cost-" and a
-        method's page
+    :param name: of ``BLOCKS``, ``METHOD_BLOCKS``, ``TUNING_BLOCKS`` or ``CHECKPOINT_BLOCKS``, a benchmark's, or "toy-"
+        or "cost-" and a method's page
     :param results: name of a benchmark -> its JSON file
     """
-    blocks = BLOCKS | METHOD_BLOCKS | TUNING_BLOCKS
+    blocks = BLOCKS | METHOD_BLOCKS | TUNING_BLOCKS | CHECKPOINT_BLOCKS
     if name in blocks:
         return blocks[name](results)
     kind, _, page = name.partition("-")
@@ -476,7 +476,54 @@ def _tuning_block(results: Results) -> str:
     return "\n\n".join((told, markdown_table(headings, rows), result["verdict"]))
 
 
+# ---------------------------------------------------------------------- checkpoints
+
+
+def _checkpoints_block(results: Results) -> str:
+    """Return what writing and reading a checkpoint costs at the paper's size."""
+    if "checkpoints" not in results:
+        return UNMEASURED
+    result = results["checkpoints"]
+    rows = [
+        (
+            name,
+            f"{entry['seconds']:.1f} s",
+            f"{entry['rows_gb']:.2f} GB" if "rows_gb" in entry else "-",
+            f"{entry['share']:.2%}" if "share" in entry else "-",
+            f"{entry['extra_memory_mb']:.0f} MB",
+        )
+        for name, entry in result.items()
+        if isinstance(entry, dict) and "seconds" in entry
+    ]
+    headings = ("", "time", "new rows", "share of the time", "memory beside the buffer")
+    return markdown_table((f"MT10, buffer of {result['buffer_gb']:.2f} GB", *headings[1:]), rows)
+
+
+def _soak_block(results: Results) -> str:
+    """Return what came of killing a run many times, and of thousands of calls."""
+    lines = []
+    if "soak" in results:
+        found = results["soak"]
+        same = "to the bit the run that nobody killed" if not found["differing"] else "**another run**"
+        lines.append(
+            f"- A run of {found['steps']:,} steps was killed {found['kills']} times at random moments, "
+            f"{found['kills_while_a_file_was_written']} of them while a checkpoint was being written. It ended as "
+            f"{same}; {found['lives_that_found_no_usable_checkpoint']} lives found no usable checkpoint."
+        )
+    if "lifecycle" in results:
+        found = results["lifecycle"]
+        grown = found["growth"]
+        lines.append(
+            f"- {found['calls']:,} short `learn` calls with resume or load, save, evaluation and close grew the number "
+            f"of processes by {grown['processes']:.0f}, of open files by {grown['open_files']:.0f}, of shared-memory "
+            f"segments by {grown['shared_memory_segments']:.0f}, and resident memory by "
+            f"{grown['resident_mb_per_1000_calls']:.1f} MB in 1,000 calls."
+        )
+    return "\n".join(lines) or UNMEASURED
+
+
 SPEED = (*PANELS, "gpu_mt10")
+ROBUST = ("checkpoints", "soak", "lifecycle")
 COMPARED = ("toy_methods", "methods")
 STUDIES = ("tune_toy",)
 
@@ -500,6 +547,13 @@ TUNING_BLOCKS: dict[str, Callable[[Results], str]] = {
 }
 """Of the page on tuning."""
 
+CHECKPOINT_BLOCKS: dict[str, Callable[[Results], str]] = {
+    "checkpoints": _checkpoints_block,
+    "soak": _soak_block,
+    "robust-machine": partial(_machine_block, names=ROBUST),
+}
+"""Of the page on checkpoints."""
+
 PAGE_BLOCKS: dict[str, Callable[[Results, str], str]] = {"toy": _toy_block, "cost": _cost_block}
 """Of the methods' own pages."""
 
@@ -512,7 +566,7 @@ def read_results(folder: Path = RESULTS) -> Results:
 
     :param folder: where they are
     """
-    paths = {name: folder / f"{name}.json" for name in (*SPEED, *COMPARED, *STUDIES)}
+    paths = {name: folder / f"{name}.json" for name in (*SPEED, *COMPARED, *STUDIES, *ROBUST)}
     return {
         name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.is_file()
     }

@@ -206,10 +206,36 @@ def test_the_methods_pages_have_their_tables():
             assert f"<!-- begin: {kind}-{method.page} -->" in page, (kind, method.page)
 
 
-def test_the_page_on_tuning_has_its_blocks():
-    page = report.TUNING.read_text()
-    for name in report.TUNING_BLOCKS:
-        assert f"<!-- begin: {name} -->" in page, name
+@pytest.mark.parametrize(
+    ("page", "blocks"),
+    [(report.TUNING, report.TUNING_BLOCKS), (report.CHECKPOINTS, report.CHECKPOINT_BLOCKS)],
+    ids=["tuning", "checkpoints"],
+)
+def test_a_page_has_its_blocks(page, blocks):
+    for name in blocks:
+        assert f"<!-- begin: {name} -->" in page.read_text(), name
+
+
+def test_checkpoints_kills_and_calls_are_told_with_what_they_left():
+    entry = {"seconds": 2.0, "rows_gb": 1.5, "rest_mb": 20.0, "extra_memory_mb": 30.0, "share": 0.01}
+    grown = {"processes": 0, "open_files": 1, "shared_memory_segments": 0, "resident_mb_per_1000_calls": 0.25}
+    results = {
+        "checkpoints": {"buffer_gb": 3.36, "ten minutes, CPU": entry, "goals": []},
+        "soak": {
+            "steps": 40_000,
+            "kills": 100,
+            "kills_while_a_file_was_written": 40,
+            "lives_that_found_no_usable_checkpoint": 0,
+            "differing": [],
+        },
+        "lifecycle": {"calls": 2000, "growth": grown},
+    }
+    table = report.render("checkpoints", results)
+    assert "| ten minutes, CPU | 2.0 s | 1.50 GB | 1.00% | 30 MB |" in table
+    told = report.render("soak", results)
+    assert "40,000 steps was killed 100 times" in told and "to the bit" in told and "open files by 1" in told
+    results["soak"]["differing"] = ["rewards"]
+    assert "another run" in report.render("soak", results)
 
 
 def test_a_study_is_told_with_its_kill_and_its_verdict():
