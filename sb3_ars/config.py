@@ -13,6 +13,7 @@ from sb3_ars.nets.lora import LoRAConfig
 
 __all__ = [
     "ARSConfig",
+    "CheckpointConfig",
     "Execution",
     "ExecutionConfig",
     "Gradient",
@@ -124,6 +125,28 @@ class ExecutionConfig:
         _check_choice("execution", self.execution, get_args(Execution))
         if self.overlap not in (None, True, False):
             raise ConfigError(f"overlap={self.overlap!r} must be True, False or None.")
+
+
+@dataclass(frozen=True)
+class CheckpointConfig:
+    """When a run is saved, so that it can go on exactly.
+
+    :raises ConfigError: naming the option, what was given and what is allowed
+    """
+
+    every: int | None = None
+    """Environment steps, summed over environments, between two checkpoints; None does not count them."""
+    every_minutes: float | None = 10.0
+    """Minutes of training between two checkpoints; None does not look at the clock."""
+    keep: int = 2
+    """Newest checkpoints that stay; those of a run that has finished are removed."""
+
+    def __post_init__(self) -> None:
+        if self.every is not None:
+            check_count("every", self.every)
+        if self.every_minutes is not None:
+            _check_positive("every_minutes", self.every_minutes)
+        check_count("keep", self.keep)
 
 
 def _check_positive(option: str, value: object) -> None:

@@ -17,7 +17,8 @@ from sb3_ars.algorithms.checkpoint import write_checkpoint
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.algorithms.run_state import check_can_be_captured
 from sb3_ars.checkpoints import CheckpointFolder
-from sb3_ars.errors import ConfigError, check_count
+from sb3_ars.config import CheckpointConfig
+from sb3_ars.errors import ConfigError
 
 __all__ = ["RunCheckpoint"]
 
@@ -55,23 +56,17 @@ class RunCheckpoint(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        if every is not None:
-            check_count("every", every)
-        is_number = isinstance(every_minutes, int | float) and not isinstance(every_minutes, bool)
-        if every_minutes is not None and (not is_number or not every_minutes > 0):
-            raise ConfigError(
-                f"every_minutes={every_minutes!r} must be a positive number of minutes, or None."
-            )
+        self.options = CheckpointConfig(every, every_minutes, keep)
         if every is None and every_minutes is None and not handle_signals:
             raise ConfigError(
                 "every=None, every_minutes=None and handle_signals=False would never write a checkpoint."
             )
         self.folder = Path(folder)
-        self.every, self.every_minutes, self.handle_signals = every, every_minutes, handle_signals
+        self.handle_signals = handle_signals
         self.notes, self.files = dict(notes or {}), [Path(file) for file in files]
         self.seconds = 0.0
         """Time spent in training, written into each manifest; set it to go on counting after a resume."""
-        self._folder = CheckpointFolder(self.folder, check_count("keep", keep))
+        self._folder = CheckpointFolder(self.folder, keep)
         self._told: signal.Signals | None = None
         self._next_step: float = 0
         self._next_time = self._counted_at = 0.0
@@ -153,9 +148,8 @@ class RunCheckpoint(BaseCallback):
             print(f"Step {self.num_timesteps:,}: checkpoint in {path} ({time.monotonic() - started:.1f} s)")
 
     def _wait_again(self) -> None:
-        never = float("inf")
-        self._next_step = never if self.every is None else self.num_timesteps + self.every
-        minutes = self.every_minutes
+        never, every, minutes = float("inf"), self.options.every, self.options.every_minutes
+        self._next_step = never if every is None else self.num_timesteps + every
         self._next_time = never if minutes is None else time.monotonic() + 60.0 * minutes
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 import tyro
 import yaml
 
-from sb3_ars.config import ARSConfig, Execution, Precision
+from sb3_ars.config import ARSConfig, CheckpointConfig, Execution, Precision
 from sb3_ars.core.schedule import SMTConfig
 from sb3_ars.envs.metaworld import metaworld_task_names
 from sb3_ars.envs.toy import TOY_TASKS
@@ -21,7 +21,6 @@ from sb3_ars.experiments.catalogue import preset_values
 __all__ = [
     "NO_PART_OF_A_METHOD",
     "AlgorithmConfig",
-    "CheckpointConfig",
     "EnvConfig",
     "EvaluationConfig",
     "PolicyConfig",
@@ -219,29 +218,6 @@ class EvaluationConfig:
             value = getattr(self, option)
             if value is not None:
                 check_count(f"evaluation.{option}", value)
-
-
-@dataclass(frozen=True)
-class CheckpointConfig:
-    """When a run is saved, so that sb3-ars train --resume goes on exactly; removed once it has finished."""
-
-    every: int | None = None
-    """Environment steps, summed over tasks, between two checkpoints; None does not count them."""
-    every_minutes: float | None = 10.0
-    """Minutes of training between two checkpoints; None does not look at the clock."""
-    keep: int = 2
-    """Newest checkpoints that stay."""
-
-    def __post_init__(self) -> None:
-        if self.every is not None:
-            check_count("checkpoint.every", self.every)
-        check_count("checkpoint.keep", self.keep)
-        minutes: Any = self.every_minutes
-        is_number = isinstance(minutes, int | float) and not isinstance(minutes, bool)
-        if minutes is not None and (not is_number or not minutes > 0):
-            raise ConfigError(
-                f"checkpoint.every_minutes={minutes!r} must be a positive number of minutes, or None."
-            )
 
 
 @dataclass(frozen=True)
