@@ -17,15 +17,17 @@ import psutil
 import pytest
 import yaml
 
+from sb3_ars.callbacks.checkpoint import RunCheckpoint
 from sb3_ars.cli import main
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments import cells as disk
 from sb3_ars.experiments import find_presets, preset_info, preset_names
-from sb3_ars.experiments.cells import cell_state, claim, clean, plan
+from sb3_ars.experiments.cells import cell_state, claim, clean, plan, release, run_folder_of
 from sb3_ars.experiments.config import load_preset
 from sb3_ars.experiments.launchers import LocalLauncher
 from sb3_ars.experiments.owner import this_process
 from sb3_ars.experiments.run_folder import find_runs, is_finished, read_run
+from sb3_ars.experiments.runner import train
 from sb3_ars.experiments.sweeps import KINDS, load_sweep, sweep_names
 
 # ---------------------------------------------------------------------- the paper's tables
@@ -380,6 +382,42 @@ def test_a_run_that_is_whole_is_kept_however_its_process_or_the_sweep_ends(tiny,
         launch([cell], tmp_path / "other", Interrupting())
     assert cell_state(cell, tmp_path / "other") == "finished"
     assert not list(tmp_path.rglob("*.running"))
+
+
+def test_a_cell_that_was_interrupted_goes_on_from_its_checkpoint(tiny, tmp_path, monkeypatch):
+    (cell,) = cells_of(tiny, "table4", only=["mt10-ars"])
+    whole = tmp_path / "whole"
+    train(cell.config, cell.preset, progress_bar=False, folder=whole)
+    working = claim(cell, tmp_path)
+    with monkeypatch.context() as patch:
+
+        def stop(self):
+            if self.num_timesteps >= 200:
+                signal.raise_signal(signal.SIGTERM)
+            return True
+
+        patch.setattr(RunCheckpoint, "_on_step", stop)
+        with pytest.raises(SystemExit):
+            train(cell.config, cell.preset, progress_bar=False, folder=run_folder_of(working))
+    release(cell, tmp_path)
+    assert cell_state(cell, tmp_path) == "missing" and working.exists()
+    assert launch([cell], tmp_path)["mt10-ars/seed0"].status == "finished"
+    assert "Going on at step 200" in (cell.folder(tmp_path) / "log.txt").read_text()
+    results = [read_run(folder).result for folder in (whole, cell.folder(tmp_path))]
+    for key in ("tasks", "timesteps", "updates", "reward_scale_history"):
+        assert results[0][key] == results[1][key], key
+    assert not list(tmp_path.rglob("*.running"))
+    # begun with another configuration, it does not go on
+    shutil.rmtree(cell.folder(tmp_path))
+    working = claim(cell, tmp_path)
+    shutil.copytree(whole, run_folder_of(working))
+    (run_folder_of(working) / "result.json").unlink()
+    (run_folder_of(working) / "checkpoints" / "step-1").mkdir(parents=True)
+    config = run_folder_of(working) / "config.yaml"
+    config.write_text(config.read_text().replace("gamma: 0.99", "gamma: 0.9"))
+    release(cell, tmp_path)
+    assert run_folder_of(working).exists()
+    assert claim(cell, tmp_path) == working and not run_folder_of(working).exists()
 
 
 def test_a_cell_whose_folder_cannot_be_written_fails_and_the_others_go_on(tiny, fake, tmp_path, monkeypatch):

@@ -109,8 +109,10 @@ class RunCheckpoint(BaseCallback):
         self._wait_again()
         if self.handle_signals and threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                before = signal.signal(number, self._on_signal)
-                self.algorithm.after_learn(signal.signal, number, before)
+                before = signal.getsignal(number)
+                if before is not signal.SIG_IGN:  # as nohup, and whoever else wants it ignored
+                    signal.signal(number, self._on_signal)
+                    self.algorithm.after_learn(signal.signal, number, before)
 
     def _on_rollout_start(self) -> None:
         is_due = self.num_timesteps >= self._next_step or time.monotonic() >= self._next_time

@@ -27,9 +27,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sb3_ars.errors import ConfigError, check_count, nearest
-from sb3_ars.experiments.config import NO_PART_OF_A_METHOD, RunConfig, build, load_preset, plain_values
+from sb3_ars.experiments.config import (
+    NO_PART_OF_A_METHOD,
+    RunConfig,
+    build,
+    load_config,
+    load_preset,
+    plain_values,
+)
 from sb3_ars.experiments.owner import host, lives, this_process
-from sb3_ars.experiments.run_folder import RESULT, Run, read_run, write_json
+from sb3_ars.experiments.run_folder import CHECKPOINTS, RESULT, Run, read_run, write_json
 from sb3_ars.experiments.scaling import Scale, load_scale, scaled
 from sb3_ars.experiments.sweeps import Sweep
 
@@ -159,7 +166,7 @@ def failed_folder(cell: Cell, output: Path) -> Path:
 def claim(cell: Cell, output: Path, cpus: int = 1) -> Path | None:
     """Make the folder that a cell is trained in, with what its process needs; return it.
 
-    Leftovers of a process that was killed are removed first.
+    Leftovers of a process that was killed are removed first, but for a run with a checkpoint, which goes on.
 
     :param cell: of the sweep
     :param output: folder of the sweep
@@ -169,9 +176,11 @@ def claim(cell: Cell, output: Path, cpus: int = 1) -> Path | None:
     working = _working(cell, output)
     with _locked(output):
         _clean(cell, output)
-        if cell.folder(output).exists() or working.exists():
+        if cell.folder(output).exists() or _in_work(working):
             return None
-        working.mkdir(parents=True)
+        if working.exists() and not _is_of(cell, working / _RUN):
+            _remove(working)
+        working.mkdir(parents=True, exist_ok=True)
         try:
             write_json(working / _OWNER, this_process())
             config = plain_values(_with_workers(cell.config, cpus))
@@ -183,7 +192,7 @@ def claim(cell: Cell, output: Path, cpus: int = 1) -> Path | None:
 
 
 def clean(cell: Cell, output: Path) -> None:
-    """Remove what a process that is no more left of a cell; a run that it had finished is kept.
+    """Remove what a process that is no more left of a cell; a run that it had finished, or that can go on, is kept.
 
     :param cell: of the sweep
     :param output: folder of the sweep
@@ -227,7 +236,7 @@ def publish(cell: Cell, output: Path) -> bool:
 
 
 def release(cell: Cell, output: Path) -> None:
-    """Give up a folder that this process claimed: a run in it that is whole is kept, all else is removed.
+    """Give up a folder that this process claimed: a run in it that is whole, or can go on, is kept, all else removed.
 
     :param cell: of the sweep
     :param output: folder of the sweep
@@ -274,8 +283,11 @@ def main(arguments: Sequence[str]) -> int:
     threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
     working = spec_path.parent
     try:
-        from sb3_ars.experiments.runner import train  # loads torch and the environments
+        from sb3_ars.experiments.runner import resume, train  # loads torch and the environments
 
+        if _can_go_on(working / _RUN):
+            resume(working / _RUN, progress_bar=False)
+            return 0
         spec = json.loads(spec_path.read_text(encoding="utf-8"))
         config = build(RunConfig, spec["config"], str(spec_path))
         train(config, spec["preset"], progress_bar=False, folder=working / _RUN)
@@ -340,8 +352,27 @@ def _clean(cell: Cell, output: Path) -> None:
 
 
 def _release(cell: Cell, output: Path) -> None:
-    if not _publish(cell, output):
-        _remove(_working(cell, output))
+    working = _working(cell, output)
+    if _publish(cell, output):
+        return
+    if _can_go_on(working / _RUN):
+        (working / _OWNER).unlink(missing_ok=True)
+    else:
+        _remove(working)
+
+
+def _can_go_on(run: Path) -> bool:
+    """Return whether a run that did not come to its end left a checkpoint."""
+    return any((run / CHECKPOINTS).glob("step-*"))
+
+
+def _is_of(cell: Cell, run: Path) -> bool:
+    """Return whether an unfinished run was begun as the cell is to be."""
+    try:
+        config = load_config(run / "config.yaml")
+    except ConfigError:
+        return False
+    return not list(_differences(plain_values(config), plain_values(cell.config)))
 
 
 def _publish(cell: Cell, output: Path) -> bool:
