@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import shutil
 import sys
 import tempfile
 import time
@@ -51,6 +52,7 @@ def one_call(number: int, folder: Path) -> None:
     elif number % 2:
         model = ARSSAC.load(folder / "model", env=env)
         model.load_replay_buffer(folder / "buffer")
+        shutil.rmtree(folder / "checkpoints")
     else:
         model = ARSSAC.resume(folder / "checkpoints", env)
     checkpoint = RunCheckpoint(folder / "checkpoints", every=20, every_minutes=None)

@@ -140,7 +140,7 @@ class CheckpointFolder:
     """
 
     def __init__(self, root: Path, keep: int = 2) -> None:
-        self.root, self.keep = root, keep
+        self.root, self.keep = root.resolve(), keep  # the process may change its folder
 
     def folder_of(self, step: int) -> Path:
         """Return the folder of the checkpoint of a step.
@@ -291,6 +291,7 @@ def latest_checkpoint(path: Path) -> Checkpoint:
     :param path: folder of checkpoints, of a run that has one, or of a single checkpoint
     :raises CheckpointError: if there is none, or none is whole
     """
+    path = path.resolve()
     if (path / MANIFEST).exists():
         folders = [path]
     else:

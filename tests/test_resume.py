@@ -457,6 +457,11 @@ def test_it_is_refused_where_it_would_not_work(tmp_path):
         model.learn(100, callback=EveryNTimesteps(10, RunCheckpoint(tmp_path)))
     with pytest.raises(ConfigError, match="not of SAC; use SB3's CheckpointCallback"):
         SAC("MlpPolicy", "Pendulum-v1").learn(10, callback=RunCheckpoint(tmp_path))
+    short(tmp_path / "other")
+    with pytest.raises(
+        ConfigError, match=r"holds checkpoints of another run.*by ARSSAC.resume, or choose another"
+    ):
+        model.learn(100, callback=RunCheckpoint(tmp_path / "other"))
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be made"):
         model.learn(100, callback=RunCheckpoint(tmp_path / "file" / "below"))

@@ -90,6 +90,12 @@ class RunCheckpoint(BaseCallback):
                 "to learn() directly or in a list."
             )
         check_can_be_captured(self.model)
+        last = self.model.last_checkpoint
+        if any(self.folder.glob("step-*")) and (last is None or last.parent != self._folder.root):
+            raise ConfigError(
+                f"{self.folder} holds checkpoints of another run, which this one's would replace; go on with that run "
+                f"by {type(self.model).__name__}.resume, or choose another folder."
+            )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
