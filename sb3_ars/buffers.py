@@ -462,19 +462,29 @@ class TaskReplayBuffer(ReplayBuffer):
                 file.write(self._plain_rows(task, slots).cpu().numpy().data.cast("B"))
 
     def restore_checkpoint_state(
-        self, state: Mapping[str, Any], parts: Iterable[tuple[Any, Sequence[int], Sequence[int]]]
+        self,
+        state: Mapping[str, Any],
+        parts: Iterable[tuple[Any, Sequence[int], Sequence[int]]],
+        keep_size: bool = False,
     ) -> None:
         """Replace what is stored by what a checkpoint kept: the same transitions in the same slots.
 
         :param state: of :meth:`checkpoint_state`
         :param parts: files of :meth:`write_rows`, oldest first, open for reading bytes, each with the number of every
             task's first transition in it and the one behind its last
-        :raises ConfigError: if a file ends too early, or the parts leave a gap; this buffer is then empty
+        :param keep_size: whether this buffer's size stays, with the newest transitions that it has room for
+        :raises ConfigError: if a file ends too early, or the parts leave a gap, or this buffer is to stay larger than
+            the other was; it is then empty
         """
         check_count("buffer_size", state["buffer_size"])
         self._check_counts(state["task_total"])
         self.reset()
-        if state["buffer_size"] != self.buffer_size:
+        if keep_size and self.buffer_size > state["buffer_size"]:
+            raise ConfigError(
+                f"buffer_size={self.buffer_size:_} is more than the run's {state['buffer_size']:_}; resume with that "
+                "or less."
+            )
+        if not keep_size and state["buffer_size"] != self.buffer_size:
             self._release_storage()
             self.buffer_size = state["buffer_size"]
             self._place_counters()

@@ -4,11 +4,11 @@ A folder of checkpoints holds one folder for each, and the rows of the replay bu
 
     checkpoints/
         step-000000120000/
-            manifest.json        format, step, versions, and bytes and SHA-256 of every file it needs
+            manifest.json        format, step, notes, and bytes and SHA-256 of every file it needs
             state.pt             tensors and plain values; torch.load(weights_only=True) reads it
         rows/
-            3f9a0c-0.bin         rows that came since the checkpoint before
-            3f9a0c-1.bin
+            3f9a0c-….bin         rows that came since the checkpoint before
+        .lock                    held by the process that writes
 
 What is under a final name is whole: files are written under another name, flushed to the disk, then renamed.
 """
@@ -16,6 +16,8 @@ What is under a final name is whole: files are written under another name, flush
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -24,7 +26,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 from sb3_ars.errors import CheckpointError
 
@@ -33,7 +35,9 @@ __all__ = [
     "CheckpointFolder",
     "FileRecord",
     "HashingFile",
+    "checkpoint_folders",
     "latest_checkpoint",
+    "lock",
 ]
 
 FORMAT = 1
@@ -141,19 +145,14 @@ class CheckpointFolder:
 
     def __init__(self, root: Path, keep: int = 2) -> None:
         self.root, self.keep = root.resolve(), keep  # the process may change its folder
-
-    def folder_of(self, step: int) -> Path:
-        """Return the folder of the checkpoint of a step.
-
-        :param step: environment steps
-        """
-        return self.root / f"step-{step:012d}"
+        self.last: Path | None = None
+        """The newest checkpoint that was written here."""
 
     @contextlib.contextmanager
     def write(
         self, step: int, shared: list[FileRecord], notes: Mapping[str, Any]
     ) -> Iterator[Callable[[str], Any]]:
-        """Write a checkpoint: inside the context, a function opens its files; at the end it gets its name.
+        """Write a checkpoint: inside the context, a function opens its files; at the end it gets its name, ``last``.
 
         An exception leaves nothing behind, and the checkpoints there were stay.
 
@@ -162,12 +161,14 @@ class CheckpointFolder:
         :param notes: plain values
         :raises OSError: if the disk is full or cannot be written
         """
-        final = self.folder_of(step)
+        number = max((checkpoint.number + 1 for checkpoint in checkpoints_in(self.root)), default=0)
+        final = self.root / f"step-{step:012d}"
+        if final.exists():  # the same step again, of a run that went back
+            final = final.with_name(f"{final.name}-{number}")
         temporary = final.with_name(final.name + _TEMPORARY)
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         records = list(shared)
-        number = max((checkpoint.number + 1 for checkpoint in checkpoints_in(self.root)), default=0)
 
         @contextlib.contextmanager
         def opened(name: str) -> Iterator[HashingFile]:
@@ -196,9 +197,9 @@ class CheckpointFolder:
                 file.flush()
                 os.fsync(file.fileno())
             sync_folder(temporary)
-            shutil.rmtree(final, ignore_errors=True)  # the same step again, of a run that went back
             temporary.rename(final)
             sync_folder(self.root)
+            self.last = final
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
@@ -220,6 +221,10 @@ class CheckpointFolder:
                 yield hashing, record
                 file.flush()
                 os.fsync(file.fileno())
+            if (folder / name).exists():
+                raise FileExistsError(
+                    errno.EEXIST, "what another checkpoint needs lies there", str(folder / name)
+                )
             temporary.rename(folder / name)
             sync_folder(folder)
         except BaseException:
@@ -227,16 +232,64 @@ class CheckpointFolder:
             raise
         record.append(FileRecord(f"{ROWS}/{name}", hashing.bytes, hashing.digest.hexdigest()))
 
+    def holds(self, record: FileRecord) -> bool:
+        """Return whether a file that was written is still there in its size; its content is not looked at.
+
+        :param record: of the file
+        """
+        path = self.root / record.path
+        return path.is_file() and path.stat().st_size == record.bytes
+
+    def remove(self, record: FileRecord) -> None:
+        """Remove a shared file that no checkpoint came to need.
+
+        :param record: of the file
+        """
+        (self.root / record.path).unlink(missing_ok=True)
+
     def prune(self) -> None:
         """Remove all but the newest checkpoints, and what nothing needs any more, half-written files included."""
         kept = checkpoints_in(self.root)[: self.keep]
         needed = {record.path for checkpoint in kept for record in checkpoint.files}
-        for path in self.root.glob("step-*"):
+        for path in self.root.glob("step-*"):  # those that were never finished too
             if path not in [checkpoint.folder for checkpoint in kept]:
                 shutil.rmtree(path, ignore_errors=True)
         for path in (self.root / ROWS).glob("*"):
             if f"{ROWS}/{path.name}" not in needed:
                 path.unlink(missing_ok=True)
+
+
+def checkpoint_folders(root: Path) -> list[Path]:
+    """Return the folders that bear the name of a checkpoint, and so were written whole, in no order.
+
+    :param root: folder of checkpoints; need not exist
+    """
+    return [folder for folder in root.glob("step-*") if folder.suffix != _TEMPORARY]
+
+
+def lock(root: Path) -> IO[str]:
+    """Let no other process write checkpoints into a folder until the file that is returned is closed, or this one ends.
+
+    :param root: folder of checkpoints; made if need be
+    :raises CheckpointError: if another process writes there, or nobody can
+    """
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        file = (root / ".lock").open("a", encoding="utf-8")
+    except OSError as error:
+        raise CheckpointError(
+            f"Nothing can be written to the folder of checkpoints {root} ({error.strerror}); choose another."
+        ) from error
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # of the process: taking it twice is no conflict
+    except OSError as error:
+        file.close()
+        if error.errno not in (errno.EACCES, errno.EAGAIN):  # a file system without locks
+            return (root / ".lock").open("a", encoding="utf-8")
+        raise CheckpointError(
+            f"Another process is training the run whose checkpoints are in {root}; wait for it, or end it first."
+        ) from error
+    return file
 
 
 def checkpoints_in(root: Path) -> list[Checkpoint]:
@@ -245,7 +298,7 @@ def checkpoints_in(root: Path) -> list[Checkpoint]:
     :param root: folder of checkpoints
     """
     found = []
-    for folder in root.glob("step-*"):
+    for folder in checkpoint_folders(root):
         with contextlib.suppress(CheckpointError):
             found.append(read_manifest(folder))
     return sorted(found, key=lambda checkpoint: checkpoint.number, reverse=True)
@@ -295,8 +348,7 @@ def latest_checkpoint(path: Path) -> Checkpoint:
     if (path / MANIFEST).exists():
         folders = [path]
     else:
-        root = path if any(path.glob("step-*")) else path / "checkpoints"
-        folders = [folder for folder in root.glob("step-*") if folder.suffix != _TEMPORARY]
+        folders = checkpoint_folders(path) or checkpoint_folders(path / "checkpoints")
     if not folders:
         raise CheckpointError(
             f"{path} holds no checkpoint. Give the folder of a run that wrote some, its checkpoints/, or one of them."

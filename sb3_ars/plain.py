@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import torch as th
 
-__all__ = ["pack", "unpack"]
+__all__ = ["PLAIN", "pack", "unpack"]
+
+PLAIN = (bool, int, float, str)
 
 _ARRAY, _DEQUE, _TUPLE = "__array__", "__deque__", "__tuple__"
 
@@ -21,11 +23,11 @@ def pack(value: Any, where: str = "value") -> Any:
     :param where: it stands, for the message
     :raises TypeError: naming the part that is anything else
     """
-    if value is None or isinstance(value, bool | int | float | str):
-        return value.item() if isinstance(value, np.generic) else value  # a np.float64 is a float
+    if value is None or type(value) in PLAIN:  # not an enumeration's member, which is pickled with its class
+        return value
     if isinstance(value, th.Tensor):
         return value.detach()
-    if isinstance(value, np.generic):
+    if isinstance(value, np.generic) and type(value.item()) in PLAIN:
         return value.item()
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         flat = np.ascontiguousarray(value).reshape(-1).view(np.uint8)  # the same memory, where it can be
@@ -56,4 +58,6 @@ def unpack(value: Any) -> Any:
         if _TUPLE in value:
             return tuple(map(unpack, value[_TUPLE]))
         return {key: unpack(item) for key, item in value.items()}
+    if isinstance(value, th.Tensor):
+        return value.clone()  # the file may be mapped into memory
     return [unpack(item) for item in value] if isinstance(value, list) else value

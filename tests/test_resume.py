@@ -1,5 +1,6 @@
 """A run that was interrupted and resumed is the run that was not: to the bit, in a new process too."""
 
+import enum
 import hashlib
 import json
 import os
@@ -35,7 +36,9 @@ from sb3_ars import (
     make_multitask_env,
     make_toy_env,
 )
-from sb3_ars.algorithms.run_state import COUNTERS, REBUILT, _option_names
+from sb3_ars.algorithms.checkpoint import write_checkpoint
+from sb3_ars.algorithms.run_state import _SESSION, COUNTERS, REBUILT, _option_names
+from sb3_ars.checkpoints import CheckpointFolder, lock
 from sb3_ars.evaluation import EvaluationProtocol
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*leaves no updates")
@@ -289,10 +292,7 @@ def test_every_attribute_of_a_model_is_saved_or_made_anew():
     """Fails once SB3, or we, add one that nobody thought of."""
     for algorithm in (ARSSAC, ARSTQC):
         model = make(algorithm, n_reset=0).learn(400)
-        options = [*_option_names(algorithm), "policy_class", "_stats_window_size"]
-        session = ["device", "verbose", "tensorboard_log", "last_checkpoint"]
-        refused = ["use_sde", "sde_sample_freq", "use_sde_at_warmup"]
-        known = {*COUNTERS, *REBUILT, *options, *session, *refused}
+        known = {*COUNTERS, *REBUILT, *_SESSION, *_option_names(algorithm)}
         assert set(vars(model)) - known == set()
 
 
@@ -361,13 +361,109 @@ def test_options_that_are_objects_are_asked_for(tmp_path):
     assert ARSSAC.resume(tmp_path, toy(), learning_rate=schedule).lr_schedule(0.5) == 5e-4
 
 
+def test_options_given_anew_stay_and_a_smaller_buffer_holds_the_newest(tmp_path):
+    model = short(tmp_path, steps=400)
+    resumed = ARSSAC.resume(tmp_path, toy(), buffer_size=20, batch_size=4, learning_starts=999)
+    assert (resumed.batch_size, resumed.learning_starts, resumed.replay_buffer.buffer_size) == (4, 999, 20)
+    newest = model.replay_buffer.rewards[:, (300 // 4 - 20) : 300 // 4]
+    found = th.roll(resumed.replay_buffer.rewards, -(75 % 20), dims=1)
+    assert th.equal(found, newest)
+    resumed.learn(40, reset_num_timesteps=False)
+
+
+def test_a_run_that_goes_back_overwrites_nothing(tmp_path):
+    model = make(n_reset=0)
+    for _ in range(2):  # learn() counts anew
+        model.learn(500, callback=checkpoints(tmp_path))
+    assert ARSSAC.resume(tmp_path, toy()).num_timesteps == 400
+    resumed = ARSSAC.resume(tmp_path, toy())
+    with pytest.warns(
+        UserWarning, match=r"begins a new run with what was resumed.*reset_num_timesteps=False"
+    ):
+        resumed.learn(500, callback=checkpoints(tmp_path))
+    assert ARSSAC.resume(tmp_path, toy()).num_timesteps == 400
+
+
+class Mode(enum.IntEnum):
+    """What pickle would store with its class."""
+
+    A = 1
+
+
+class Remembering(Calm):
+    """Keeps numbers of several kinds from one episode to the next, and what is not plain."""
+
+    def __init__(self):
+        self.mode, self.episodes, self.count = Mode.A, np.zeros(1, np.int64), np.int64(0)
+        self.seen = [0.0]
+
+    def reset(self, *, seed=None, options=None):
+        self.episodes += 1
+        self.count += 1
+        self.seen.append(float(self.count))
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, float(self.episodes[0] + self.count + sum(self.seen)), *rest
+
+
+def test_what_an_env_remembers_from_episode_to_episode_comes_back(tmp_path):
+    def env():
+        tasks = {"a": Remembering, "b": Calm}
+        return make_multitask_env(tasks, seed=0, n_workers=0, max_episode_steps=17)
+
+    make_model = partial(make, ARSSAC, env, reward_scaling="none")
+    assert_same(run_whole(make_model)[1], run_in_two(make_model, tmp_path, env=env)[1])
+
+
+class Counting(ARSSAC):
+    """A user's own algorithm, with something of its own."""
+
+    def __init__(self, *args, **kwargs):
+        self.counted = 0
+        super().__init__(*args, **kwargs)
+
+
+def test_what_a_subclass_adds_is_named_as_lost(tmp_path):
+    with pytest.warns(UserWarning, match="counted of Counting is not saved"):
+        short(tmp_path, algorithm=Counting)
+    assert Counting.resume(tmp_path, toy()).num_timesteps == 200
+
+
+def test_other_versions_are_told(tmp_path):
+    short(tmp_path)
+    for path in tmp_path.glob("*/manifest.json"):
+        values = json.loads(path.read_text())
+        values["notes"]["versions"]["torch"] = "1.0"
+        path.write_text(json.dumps(values))
+    with pytest.warns(UserWarning, match=r"other versions \(torch 1.0 to .*perhaps not to the bit"):
+        ARSSAC.resume(tmp_path, toy())
+
+
+@pytest.mark.filterwarnings("ignore:Checkpoints of this run are not exact", "ignore:This run does not go on")
+def test_a_plain_buffer_that_stores_each_frame_once_keeps_the_newest(tmp_path):
+    options = {
+        "batch_size": 16,
+        "buffer_size": 500,
+        "learning_starts": 50,
+        "policy_kwargs": {"net_arch": [8]},
+    }
+    options |= {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    model = ARSSAC("MlpPolicy", "Pendulum-v1", seed=0, **options)
+    model.learn(190, callback=checkpoints(tmp_path, every=90))  # within an episode
+    resumed = ARSSAC.resume(tmp_path, "Pendulum-v1")
+    assert resumed.num_timesteps == 180
+    assert np.array_equal(resumed.replay_buffer.observations[:181], model.replay_buffer.observations[:181])
+
+
 # ---------------------------------------------------------------------- signals
 
 
 @pytest.mark.parametrize(
     ("number", "raised"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)]
 )
-def test_a_signal_ends_training_with_a_checkpoint(number, raised, tmp_path, capsys):
+def test_a_signal_ends_training_with_a_checkpoint(number, raised, tmp_path, capfd):
     class Tell(BaseCallback):
         def _on_step(self):
             if self.num_timesteps == 500:
@@ -379,12 +475,46 @@ def test_a_signal_ends_training_with_a_checkpoint(number, raised, tmp_path, caps
     before = signal.getsignal(number)
     with pytest.raises(raised) as error:
         make().learn(TOTAL, callback=[RunCheckpoint(tmp_path), Tell()])
-    assert signal.getsignal(number) is before and "checkpoint is written" in capsys.readouterr().out
+    assert signal.getsignal(number) is before and "checkpoint is written" in capfd.readouterr().err
     assert number is signal.SIGINT or error.value.code == 143
     model = ARSSAC.resume(tmp_path, toy())
     assert model.num_timesteps == 500
     model.learn(model.remaining_timesteps, reset_num_timesteps=False)
     assert_same(whole, everything(model))
+
+
+def test_a_signal_in_the_last_rollout_is_no_less_heard(tmp_path):
+    class Tell(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == TOTAL:
+                signal.raise_signal(signal.SIGTERM)
+            return True
+
+    with pytest.raises(SystemExit):
+        make().learn(TOTAL, callback=[RunCheckpoint(tmp_path), Tell()])
+    model = ARSSAC.resume(tmp_path, toy())
+    assert model.num_timesteps == TOTAL and model.remaining_timesteps == 0
+
+
+GROUP = """
+import sys
+from tests.test_resume import *
+
+class Tell(BaseCallback):
+    def _on_step(self):
+        if self.num_timesteps == 500:
+            os.killpg(0, signal.SIGTERM)
+        return True
+
+make(env=lambda: toy(n_workers=2)).learn(TOTAL, callback=[RunCheckpoint(sys.argv[1]), Tell()])
+"""
+
+
+def test_a_sigterm_to_all_processes_ends_with_a_checkpoint(tmp_path):
+    command = [sys.executable, "-W", "ignore", "-c", GROUP, str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": "."}
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], env=environment, start_new_session=True)
+    assert done.returncode == 143 and ARSSAC.resume(tmp_path, toy()).num_timesteps == 500
 
 
 def test_a_second_interrupt_does_not_wait(tmp_path):
@@ -432,6 +562,15 @@ def test_diverged_networks_are_not_saved_and_the_last_good_checkpoint_is_named(t
     assert ARSSAC.resume(tmp_path, toy()).num_timesteps == 400
 
 
+def test_a_temperature_of_nan_is_no_good_checkpoint(tmp_path):
+    model = make()
+    with th.no_grad():
+        model.log_ent_coef.fill_(float("nan"))
+    model.env.reset()
+    with pytest.raises(DivergedError, match="hold NaN"):
+        write_checkpoint(model, CheckpointFolder(tmp_path))
+
+
 # ---------------------------------------------------------------------- refused
 
 
@@ -444,6 +583,8 @@ def test_diverged_networks_are_not_saved_and_the_last_good_checkpoint_is_named(t
         ({"every_minutes": True}, "every_minutes=True must be a positive number"),
         ({"keep": 0}, "keep=0 must be an integer of at least 1"),
         ({"every_minutes": None, "handle_signals": False}, "would never write a checkpoint"),
+        ({"files": ["a/state.pt"]}, "must have different names, none of them state.pt"),
+        ({"files": ["a/log", "b/log"]}, "must have different names"),
     ],
 )
 def test_wrong_options_are_refused(options, message, tmp_path):
@@ -477,6 +618,8 @@ def test_another_algorithm_other_tasks_or_sizes_are_refused(tmp_path):
         ARSSAC.resume(tmp_path, toy(n_envs_per_task=2))
     with pytest.raises(CheckpointError, match="does not fit this model"):
         ARSSAC.resume(tmp_path, toy(), policy_kwargs={"net_arch": [8]})
+    with pytest.raises(ConfigError, match="buffer_size=1_000 is more than the run's 130"):
+        ARSSAC.resume(tmp_path, toy(), buffer_size=1000)
     with pytest.raises(CheckpointError, match="holds no checkpoint"):
         ARSSAC.resume(tmp_path / "nowhere", toy())
 
@@ -496,3 +639,20 @@ def test_a_checkpoint_names_no_code(tmp_path):
     manifest.write_text(json.dumps(values))
     with pytest.raises(CheckpointError, match="names a class of 'os'"):
         ARSSAC.resume(tmp_path, toy())
+
+
+def test_two_processes_do_not_write_into_one_folder(tmp_path):
+    script = "import sys, time; from pathlib import Path; from sb3_ars.checkpoints import lock\n"
+    script += "file = lock(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": "."}
+    other = subprocess.Popen(command, cwd=Path(__file__).parents[1], env=environment, stdout=subprocess.PIPE)
+    try:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(CheckpointError, match="Another process is training the run"):
+            short(tmp_path)
+    finally:
+        other.kill()
+        other.communicate()
+    with lock(tmp_path):
+        short(tmp_path)  # this process may

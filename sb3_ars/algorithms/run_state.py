@@ -10,7 +10,7 @@ import importlib
 import inspect
 import random
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = [
     "capture",
     "check_can_be_captured",
+    "check_same_options",
     "constructor_arguments",
     "restore",
     "restore_pending",
@@ -55,7 +56,6 @@ COUNTERS = (
     "_num_timesteps_at_start",
     "_current_progress_remaining",
     "_auto_learning_starts",
-    "_last_dump_at",
     "_warned_of_waiting",
     "_last_obs",
     "_last_original_obs",
@@ -69,9 +69,15 @@ REBUILT = (
     *("batch_norm_stats", "batch_norm_stats_target", "lr_schedule", "start_time", "timer", "is_multi_task"),
     *("observation_space", "n_envs", "task_names", "task_of_env", "_vec_normalize_env", "_custom_logger"),
     *("_captured_actor", "_captured_updates", "_combiner", "_is_stepping", "_plan", "_stepping_env"),
-    *("_update_state", "_updates_are_done", "_after_learn", "_to_restore", "rows_on_disk"),
+    *("_update_state", "_updates_are_done", "_after_learn", "_to_restore", "rows_on_disk", "_last_dump_at"),
 )
 """The others, options apart: captured below piece by piece, or made anew."""
+
+_SESSION = (
+    *("policy_class", "_stats_window_size", "device", "verbose", "tensorboard_log", "last_checkpoint"),
+    *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
+)
+"""Those that are options under another name, of one session alone, or refused."""
 
 _SAFE_MODULES = ("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib.", "sb3_ars.")
 _BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
@@ -87,17 +93,19 @@ def check_can_be_captured(model: MultiTaskOffPolicyAlgorithm) -> None:
     :raises ConfigError: naming the option and the remedy
     """
     buffer = model.replay_buffer
-    if not isinstance(buffer, TaskReplayBuffer) and type(buffer) not in _BUFFERS:
+    if type(buffer) not in (TaskReplayBuffer, *_BUFFERS):
         raise ConfigError(
             f"replay_buffer_class={type(buffer).__name__} has memory that a checkpoint does not know; leave it out, or "
             "save with model.save and model.save_replay_buffer instead."
         )
     if model.action_noise is not None:
         pack(_noise_state(model.action_noise), "action_noise")
-    lost = _what_envs_lose(model.env)
+    own = sorted(set(vars(model)) - {*COUNTERS, *REBUILT, *_SESSION, *_option_names(type(model))})
+    attributes = f"{', '.join(own)} of {type(model).__name__} is not saved" if own else ""
+    lost = [words for words in (_what_envs_lose(model.env), attributes) if words]
     if lost:
         warnings.warn(
-            f"Checkpoints of this run are not exact: {lost}. Everything else goes on where it stood.",
+            f"Checkpoints of this run are not exact: {'; '.join(lost)}. Everything else goes on where it stood.",
             stacklevel=3,
         )
 
@@ -131,11 +139,14 @@ def capture(model: MultiTaskOffPolicyAlgorithm, callback: BaseCallback | None) -
     return packed
 
 
-def restore(model: MultiTaskOffPolicyAlgorithm, packed: Mapping[str, Any]) -> None:
+def restore(
+    model: MultiTaskOffPolicyAlgorithm, packed: Mapping[str, Any], given: Collection[str] = ()
+) -> None:
     """Make a model, built with the same options, what it was when :func:`capture` looked; the task buffer is filled.
 
     :param model: with an environment made like the one before
     :param packed: what :func:`capture` returned
+    :param given: options that were given anew, and stay
     :raises CheckpointError: if it does not fit this model
     """
     try:
@@ -143,6 +154,8 @@ def restore(model: MultiTaskOffPolicyAlgorithm, packed: Mapping[str, Any]) -> No
         _check_fits(model, state)
         _restore_learned(model, state)
         for name, value in state["counters"].items():
+            if name.removeprefix("_auto_") in given:
+                continue
             if name == "task_episodes":  # the log holds these very deques
                 for episodes, saved in zip(model.task_episodes, value, strict=True):
                     episodes.extend(saved)
@@ -219,6 +232,23 @@ def _option_names(cls: type[Any]) -> list[str]:
     return [name for name in names if name not in session]
 
 
+def check_same_options(model: MultiTaskOffPolicyAlgorithm, options: Mapping[str, Any]) -> None:
+    """Raise unless a model was built with the options that were saved.
+
+    :param model: built for the run
+    :param options: of :func:`capture`, packed
+    :raises CheckpointError: naming an option that differs
+    """
+    now = _options_of(model)
+    for name in sorted({*options, *now} - {"missing"}):
+        before, after = unpack(options.get(name)), unpack(now.get(name))
+        if before != after:
+            raise CheckpointError(
+                f"The run was trained with {name}={before!r}, and is now to go on with {after!r}; put its config.yaml "
+                "back as it was."
+            )
+
+
 def constructor_arguments(options: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """Return what to construct a model with: saved options, replaced by those given now.
 
@@ -278,7 +308,7 @@ def _decode(value: Any) -> Any:
                     f"The checkpoint names a class of {module!r}, which is not loaded from there."
                 )
             found = getattr(importlib.import_module(module), name)
-            if not isinstance(found, type):
+            if not isinstance(found, type) or not f"{found.__module__}.".startswith(_SAFE_MODULES):
                 raise CheckpointError(
                     f"The checkpoint names {value['__class__']!r} as a class, which is none."
                 )
@@ -297,7 +327,8 @@ def _replay_state(buffer: ReplayBuffer | None) -> dict[str, Any]:
         return buffer.checkpoint_state()
     assert buffer is not None
     arrays = {name: value for name, value in vars(buffer).items() if _is_storage(value)}
-    n = buffer.size()
+    # with optimize_memory_usage the newest next observation lies one further
+    n = buffer.size() + int(buffer.optimize_memory_usage)
     filled = {
         name: {key: item[:n] for key, item in value.items()} if isinstance(value, dict) else value[:n]
         for name, value in arrays.items()
@@ -434,6 +465,12 @@ def restore_pending(model: MultiTaskOffPolicyAlgorithm, callback: BaseCallback) 
     pending, model._to_restore = model._to_restore, None
     if pending is None:
         return
+    if model.num_timesteps == 0 and model._n_updates > 0:
+        warnings.warn(
+            "learn() begins a new run with what was resumed; to go on with that run, give "
+            "learn(model.remaining_timesteps, reset_num_timesteps=False).",
+            stacklevel=4,
+        )
     _restore_log(model.logger, pending["log"])
     _restore_callbacks(callback, pending["callbacks"])
     if pending["action_noise"] is not None and model.action_noise is not None:
@@ -456,6 +493,8 @@ _KNOWN_WRAPPERS = {
     VecNormalize: ("obs_rms", "ret_rms", "returns", "old_reward"),
     VecMonitor: ("episode_count", "episode_returns", "episode_lengths"),
 }
+_OF_EPISODES = ("returns", "old_reward", "episode_returns", "episode_lengths")
+"""Of those, what would be untrue of a new episode."""
 
 
 def _what_envs_lose(env: Any) -> str:
@@ -498,7 +537,7 @@ def _restore_env(model: MultiTaskOffPolicyAlgorithm, state: Mapping[str, Any]) -
         warnings.warn(f"This run does not go on to the bit: {_what_envs_lose(env)}.", stacklevel=4)
     for wrapper, saved in zip(wrappers, state["wrappers"], strict=True):
         for name, value in saved.items():
-            if value is not None:
+            if value is not None and (is_exact or name not in _OF_EPISODES):
                 setattr(wrapper, name, _restored_rms(getattr(wrapper, name, None), value))
     normalizer = model._vec_normalize_env
     if is_exact and any(type(wrapper) not in _KNOWN_WRAPPERS for wrapper in wrappers):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -16,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_ars.algorithms.checkpoint import write_checkpoint
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.algorithms.run_state import check_can_be_captured
-from sb3_ars.checkpoints import CheckpointFolder
+from sb3_ars.checkpoints import CheckpointFolder, checkpoint_folders, lock
 from sb3_ars.config import CheckpointConfig
 from sb3_ars.errors import ConfigError
 
@@ -64,6 +65,12 @@ class RunCheckpoint(BaseCallback):
         self.folder = Path(folder)
         self.handle_signals = handle_signals
         self.notes, self.files = dict(notes or {}), [Path(file) for file in files]
+        names = [file.name for file in self.files]
+        taken = {"state.pt", "manifest.json"} & set(names)
+        if taken or len(set(names)) < len(names):
+            raise ConfigError(
+                f"files: {', '.join(names)} must have different names, none of them state.pt or manifest.json."
+            )
         self.seconds = 0.0
         """Time spent in training, written into each manifest; set it to go on counting after a resume."""
         self._folder = CheckpointFolder(self.folder, keep)
@@ -91,7 +98,7 @@ class RunCheckpoint(BaseCallback):
             )
         check_can_be_captured(self.model)
         last = self.model.last_checkpoint
-        if any(self.folder.glob("step-*")) and (last is None or last.parent != self._folder.root):
+        if checkpoint_folders(self.folder) and (last is None or last.parent != self._folder.root):
             raise ConfigError(
                 f"{self.folder} holds checkpoints of another run, which this one's would replace; go on with that run "
                 f"by {type(self.model).__name__}.resume, or choose another folder."
@@ -112,19 +119,28 @@ class RunCheckpoint(BaseCallback):
         self._told = None
         self._counted_at = time.monotonic()
         self.algorithm.after_learn(self._count_seconds)
+        self.algorithm.after_learn(lock(self._folder.root).close)
         self._wait_again()
         if self.handle_signals and threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 before = signal.getsignal(number)
                 if before is not signal.SIG_IGN:  # as nohup, and whoever else wants it ignored
                     signal.signal(number, self._on_signal)
-                    self.algorithm.after_learn(signal.signal, number, before)
+                    # None: of a program that has embedded Python
+                    self.algorithm.after_learn(signal.signal, number, before or signal.SIG_DFL)
 
     def _on_rollout_start(self) -> None:
         is_due = self.num_timesteps >= self._next_step or time.monotonic() >= self._next_time
         if is_due or self._told is not None:
-            self._write()
-            self._wait_again()
+            self.write()
+        self._end_if_told()
+
+    def _on_training_end(self) -> None:
+        if self._told is not None:  # in the last rollout
+            self.write()
+        self._end_if_told()
+
+    def _end_if_told(self) -> None:
         if self._told is signal.SIGINT:
             raise KeyboardInterrupt
         if self._told is not None:
@@ -133,7 +149,9 @@ class RunCheckpoint(BaseCallback):
     def _on_step(self) -> bool:
         return True
 
-    def _write(self) -> None:
+    def write(self) -> None:
+        """Write a checkpoint now, between two rollouts or after the last; a failure is a warning."""
+        self._wait_again()
         started = time.monotonic()
         try:
             self._count_seconds()
@@ -141,13 +159,17 @@ class RunCheckpoint(BaseCallback):
             path = write_checkpoint(
                 self.algorithm, self._folder, self.locals.get("callback"), notes, self.files
             )
-        except OSError as error:
+        except (OSError, TypeError) as error:
             last = self.algorithm.last_checkpoint
+            then = (
+                "Training goes on, and the next one is tried when it is due"
+                if self._told is None
+                else "Training ends"
+            )
             warnings.warn(
                 f"The checkpoint at step {self.num_timesteps:,} could not be written to {self.folder} "
-                f"({error.strerror or error}). Training goes on; "
-                + (f"the last good one is {last}." if last else "there is none yet.")
-                + " Free some space: the next one is tried when it is due.",
+                f"({getattr(error, 'strerror', None) or error}). {then}; "
+                + (f"the last good one is {last}." if last else "there is none yet."),
                 stacklevel=2,
             )
             return
@@ -165,4 +187,5 @@ class RunCheckpoint(BaseCallback):
         if self._told is signal.SIGINT and told is signal.SIGINT:
             raise KeyboardInterrupt
         self._told = told
-        print(f"\n{told.name}: a checkpoint is written as soon as this step is done.", flush=True)
+        # not print: the signal may have come in the middle of one
+        os.write(2, f"\n{told.name}: a checkpoint is written as soon as this step is done.\n".encode())

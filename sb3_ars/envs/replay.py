@@ -7,6 +7,7 @@ of its own, whatever it simulates with, and checked by comparing the last observ
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +29,9 @@ __all__ = [
 LONGEST_REPLAY = 10_000
 """Steps of an episode up to which its actions are kept; a longer one cannot be brought back."""
 
+_LARGEST = 10_000
+"""Elements of an array that is kept from one episode to the next."""
+
 Generator = np.random.Generator | np.random.RandomState
 Layer = dict[str, Any]
 
@@ -36,7 +40,8 @@ Layer = dict[str, Any]
 class EpisodeStart:
     """What an env held when an episode began.
 
-    :param layers: of each wrapper and the env itself, outermost first: plain values and generators' states by attribute
+    :param layers: of each wrapper and the env itself, outermost first: plain values (numbers, text, small arrays,
+        lists of these) and generators' states by attribute
     :param seed: that its reset was given
     :param options: likewise
     """
@@ -136,7 +141,7 @@ def restore_start(env: gym.Env[Any, Any], start: EpisodeStart) -> None:
         raise ValueError(f"{len(found) - 1} wrappers instead of {len(start.layers) - 1}")
     env.reset(seed=0)
     for layer, (values, states) in zip(found, start.layers, strict=True):
-        vars(layer).update(values)
+        _put(layer, values)
         for name, state in states.items():
             generator = vars(layer).get(name)
             if not isinstance(generator, Generator):
@@ -145,13 +150,26 @@ def restore_start(env: gym.Env[Any, Any], start: EpisodeStart) -> None:
 
 
 def _plain(layer: gym.Env[Any, Any]) -> Layer:
-    return {name: value for name, value in vars(layer).items() if _is_plain(value)}
+    return {name: copy.deepcopy(value) for name, value in vars(layer).items() if _is_plain(value)}
 
 
 def _is_plain(value: Any) -> bool:
-    if isinstance(value, tuple):
+    if type(value) in (tuple, list):
         return all(map(_is_plain, value))
-    return value is None or isinstance(value, bool | int | float | str)
+    if type(value) is np.ndarray:  # not a view, such as one of a simulator's memory
+        is_own = value.flags.owndata and value.flags.writeable
+        return is_own and value.dtype.kind in "biuf" and value.size <= _LARGEST
+    return value is None or type(value) in (bool, int, float, str) or isinstance(value, np.number | np.bool_)
+
+
+def _put(layer: gym.Env[Any, Any], values: Layer) -> None:
+    """Give attributes their values back, arrays in place: others may hold them too."""
+    for name, value in values.items():
+        before: Any = vars(layer).get(name)
+        if type(value) is np.ndarray and _is_plain(before) and np.shape(before) == value.shape:
+            before[...] = value
+        else:
+            vars(layer)[name] = copy.deepcopy(value)
 
 
 def _generator_states(layer: gym.Env[Any, Any]) -> Layer:

@@ -568,7 +568,8 @@ class WorkerPool:
         """Bring every env to where its episode was; return why not, for those that now begin a new one."""
         parts = [(episodes[c.start : c.stop],) for c in self._chunks]
         self._send_all([("play_again", part) for part in parts])
-        self._collect(max(START_TIMEOUT, self._timeout), "playing its episodes again")
+        # up to LONGEST_REPLAY steps of each env, one env after the other
+        self._collect(10 * max(START_TIMEOUT, self._timeout), "playing its episodes again")
         return self._take_lists()
 
     def step_async(self) -> None:
@@ -913,6 +914,9 @@ _DONE, _REPLY = 1, 2  # what is answered: nothing to add, or something in the pi
 _RESULT, _ERROR = b"r", b"e"  # what that begins with
 _QUESTION, _ANSWER = 0, 1  # who writes which of a line's words
 
+_LAST_PATIENCE = 30
+"""Seconds that a worker which got SIGTERM waits for another question."""
+
 _LOOK_AROUND = 0.1
 """Seconds between two looks at whether the other side still lives, while waiting for it."""
 
@@ -1004,8 +1008,11 @@ def _max_episode_steps(env: gym.Env[Any, Any]) -> int | None:
 
 def _work(line: _Line, stale: Sequence[Connection], envs: TaskEnvs) -> None:
     """Serve one chunk of envs until told to stop or until the parent is gone."""
-    # Ctrl-C reaches the whole process group; the parent decides what happens then.
+    # Ctrl-C and a cluster's SIGTERM reach the whole process group; the parent decides what happens then, and may need
+    # these envs for what it does. Should it ask nothing more, this process ends after a while.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    told: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
     for other in stale:
         other.close()
     torch = sys.modules.get("torch")  # present only in a forked worker, with the parent's number of threads
@@ -1013,16 +1020,19 @@ def _work(line: _Line, stale: Sequence[Connection], envs: TaskEnvs) -> None:
         torch.set_num_threads(1)
     # A pipe at its end or broken means that the parent is gone: nobody is left to tell.
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while (question := _next_question(line)) != _CLOSE:
+        while (question := _next_question(line, told)) != _CLOSE:
             message = line.conn.recv_bytes() if question == _COMMAND else None
             line.answer(_answer(envs, message))
     envs.close()
 
 
-def _next_question(line: _Line) -> int:
-    parent = multiprocessing.parent_process()
+def _next_question(line: _Line, told: Sequence[int]) -> int:
+    parent, waited = multiprocessing.parent_process(), 0
     while not line.go.acquire(timeout=_LOOK_AROUND * 10):
+        waited += 1
         if parent is not None and not parent.is_alive():
+            return _CLOSE
+        if told and waited >= _LAST_PATIENCE:
             return _CLOSE
     return int(line.words[_QUESTION])
 

@@ -26,6 +26,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from sb3_ars.checkpoints import checkpoint_folders
 from sb3_ars.errors import ConfigError, check_count, nearest
 from sb3_ars.experiments.config import (
     NO_PART_OF_A_METHOD,
@@ -363,7 +364,7 @@ def _release(cell: Cell, output: Path) -> None:
 
 def _can_go_on(run: Path) -> bool:
     """Return whether a run that did not come to its end left a checkpoint."""
-    return any((run / CHECKPOINTS).glob("step-*"))
+    return bool(checkpoint_folders(run / CHECKPOINTS))
 
 
 def _is_of(cell: Cell, run: Path) -> bool:

@@ -24,7 +24,7 @@ from sb3_ars.algorithms.tqc import ARSTQC
 from sb3_ars.callbacks.checkpoint import RunCheckpoint
 from sb3_ars.callbacks.evaluation import TaskEvalCallback
 from sb3_ars.callbacks.schedule import TaskScheduleCallback
-from sb3_ars.checkpoints import Checkpoint, latest_checkpoint
+from sb3_ars.checkpoints import Checkpoint, checkpoint_folders, latest_checkpoint, lock
 from sb3_ars.envs import make_metaworld_env, make_toy_env
 from sb3_ars.errors import ConfigError
 from sb3_ars.evaluation import (
@@ -114,11 +114,10 @@ def resume(folder: Path, progress_bar: bool = True) -> RunResult:
     config = load_config(folder / "config.yaml")
     if is_finished(folder) and not read_run(folder).result.get("interrupted"):
         raise ConfigError(f"The run in {folder} has finished; there is nothing to resume. Train a new one.")
-    checkpoint = latest_checkpoint(folder / CHECKPOINTS)
-    (folder / RESULT).unlink(missing_ok=True)  # of the run as it was when it was interrupted
-    return _run(
-        config, str(checkpoint.notes.get("name", folder.name)), folder, checkpoint, progress_bar, None
-    )
+    with lock(folder / CHECKPOINTS):
+        checkpoint = latest_checkpoint(folder / CHECKPOINTS)
+        name = str(checkpoint.notes.get("name", folder.name))
+        return _run(config, name, folder, checkpoint, progress_bar, None)
 
 
 def _run(
@@ -146,6 +145,7 @@ def _run(
             model.set_logger(new_logger(folder, to_screen))
         else:
             load_checkpoint(model, checkpoint)
+            (folder / RESULT).unlink(missing_ok=True)  # of the run as it was when it was interrupted
             print(f"Going on at step {model.num_timesteps:,}, from {checkpoint.folder}.")
             model.set_logger(
                 continued_logger(folder, to_screen, checkpoint.folder / PROGRESS, model.num_timesteps)
@@ -342,7 +342,7 @@ def _learn(
             config.algorithm.total_timesteps - model.num_timesteps,
             callback=callbacks,
             log_interval=config.log_interval,
-            reset_num_timesteps=model.num_timesteps == 0,
+            reset_num_timesteps=model.last_checkpoint is None,
         )
     except KeyboardInterrupt:
         if model.replay_buffer is None or model.replay_buffer.size() == 0:
@@ -353,6 +353,10 @@ def _learn(
             f"Go on with: sb3-ars train --resume {folder}"
         )
     except SystemExit:  # told to end, and at once
+        if not checkpoint_folders(folder / CHECKPOINTS):  # it could not be written
+            model.save(folder / "policy")
+            print(f"\nNo checkpoint could be written; what was learned is in {folder / 'policy.zip'}")
+            raise
         print(f"\nStopped at step {model.num_timesteps:,}. Go on with: sb3-ars train --resume {folder}")
         raise
     except Exception:
@@ -366,6 +370,8 @@ def _learn(
         if hasattr(bar, "pbar"):
             bar.pbar.close()
     model.dump_logs()  # so that the log's last row is the run's last step
+    if not interrupted:
+        checkpoints.write()  # the evaluation that follows may take long
     return interrupted
 
 
@@ -378,8 +384,10 @@ def _export(model: MultiTaskOffPolicyAlgorithm, folder: Path) -> None:
 
 
 def _remove_if_unused(folder: Path) -> None:
-    """Leave no folder behind where training never began."""
-    if not (folder / "policy.zip").exists() and not any((folder / CHECKPOINTS).glob("step-*")):
+    """Leave no folder behind where nothing was learned or logged yet."""
+    log = folder / PROGRESS
+    has_log = log.is_file() and log.stat().st_size > 0
+    if not (has_log or (folder / "policy.zip").exists() or checkpoint_folders(folder / CHECKPOINTS)):
         shutil.rmtree(folder, ignore_errors=True)
 
 

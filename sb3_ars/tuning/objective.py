@@ -6,6 +6,7 @@ import dataclasses
 import gc
 import importlib.metadata
 import json
+import shutil
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -23,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, WorkerError, check_count
 from sb3_ars.experiments.config import RunConfig, load_preset
-from sb3_ars.experiments.run_folder import RESULT, write_json
+from sb3_ars.experiments.run_folder import CHECKPOINTS, RESULT, write_json
 from sb3_ars.experiments.runner import RunResult, train
 from sb3_ars.experiments.scaling import load_scale, scaled
 from sb3_ars.tuning.liveness import claim, counts, kept_alive, retry
@@ -181,7 +182,10 @@ class Objective:
         log = trial_folder / f"seed{config.seed}.log"
         with log.open("w", encoding="utf-8") as file, redirect_stdout(file):
             callback = _AfterEvaluation(report)
-            result = train(config, self.preset, False, folder=folder, after_evaluation=callback)
+            try:
+                result = train(config, self.preset, False, folder=folder, after_evaluation=callback)
+            finally:
+                shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)  # a trial does not go on
         _raise_if_interrupted(folder)
         return result
 
