@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 import time
@@ -17,7 +18,7 @@ from sb3_ars.algorithms.checkpoint import write_checkpoint
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.algorithms.run_state import check_can_be_captured
 from sb3_ars.checkpoints import CheckpointFolder
-from sb3_ars.errors import ConfigError, check_count
+from sb3_ars.errors import ConfigError, check_count, check_flag, check_path, check_verbose
 
 __all__ = ["RunCheckpoint"]
 
@@ -54,9 +55,10 @@ class RunCheckpoint(BaseCallback):
         files: Sequence[str | Path] = (),
         verbose: int = 0,
     ) -> None:
-        super().__init__(verbose)
+        super().__init__(check_verbose("verbose", verbose))
         if every is not None:
             check_count("every", every)
+        check_flag("handle_signals", handle_signals)
         is_number = isinstance(every_minutes, int | float) and not isinstance(every_minutes, bool)
         if every_minutes is not None and (not is_number or not every_minutes > 0):
             raise ConfigError(
@@ -66,9 +68,17 @@ class RunCheckpoint(BaseCallback):
             raise ConfigError(
                 "every=None, every_minutes=None and handle_signals=False would never write a checkpoint."
             )
-        self.folder = Path(folder)
+        try:
+            dict(notes or {}), json.dumps(notes, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"notes={notes!r} must be a mapping of plain values, or None: {error}."
+            ) from error
+        if isinstance(files, str) or not isinstance(files, Sequence):
+            raise ConfigError(f"files={files!r} must be a list of paths.")
+        self.folder = check_path("folder", folder)
         self.every, self.every_minutes, self.handle_signals = every, every_minutes, handle_signals
-        self.notes, self.files = dict(notes or {}), [Path(file) for file in files]
+        self.notes, self.files = dict(notes or {}), [check_path("files entry", file) for file in files]
         self.seconds = 0.0
         """Time spent in training, written into each manifest; set it to go on counting after a resume."""
         self._folder = CheckpointFolder(self.folder, check_count("keep", keep))
