@@ -77,7 +77,9 @@ def tune(
     n_trials = check_count("n_trials (--n-trials)", n_trials)
     is_number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
     if timeout is not None and not (is_number and timeout > 0):
-        raise ConfigError(f"timeout (--timeout) is {timeout} s, but must be more than 0.")
+        raise ConfigError(
+            f"timeout (--timeout) is {f'{timeout:g}' if is_number else repr(timeout)} s, but must be more than 0."
+        )
     if name is not None and not (isinstance(name, str) and name and name == Path(name).name):
         raise ConfigError(
             f"name (--study)={name!r} must be the name of a folder in --output, without slashes."
