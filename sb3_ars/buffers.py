@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ars.core.reward_scale import RewardStatistics
-from sb3_ars.errors import ConfigError, EnvContractError, check_count
+from sb3_ars.errors import ConfigError, EnvContractError, check_count, check_flag
 from sb3_ars.machine import available_memory
 
 __all__ = ["TaskReplayBuffer"]
@@ -100,7 +100,7 @@ class TaskReplayBuffer(ReplayBuffer):
         _check_spaces(observation_space, action_space, len(task_names))
         # ReplayBuffer.__init__ would allocate NumPy arrays at once (SB3 2.9.2, common/buffers.py)
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs=n_envs)
-        self.optimize_memory_usage = bool(optimize_memory_usage)
+        self.optimize_memory_usage = check_flag("optimize_memory_usage", optimize_memory_usage)
         self.handle_timeout_termination = handle_timeout_termination
         self.task_names = task_names
         self.n_tasks = len(task_names)

@@ -66,7 +66,7 @@ class ARSConfig:
             check_count("n_reset", self.n_reset, minimum=0)
         if self.n_reset is not None and self.param_resets is not None:
             raise ConfigError(
-                f"n_reset={self.n_reset} and param_resets={list(self.param_resets)} both say when to reset; "
+                f"n_reset={self.n_reset} and param_resets={self.param_resets!r} both say when to reset; "
                 "give one and set the other to None."
             )
         check_count("updates_after_reset", self.updates_after_reset, minimum=0)
@@ -93,6 +93,7 @@ class ARSConfig:
 
         :param total_timesteps: length of the whole run in environment steps
         :param n_tasks: number of tasks
+        :raises ConfigError: for as many resets as steps
 
         Source: paper, Algorithm 1; the spacing T / (n_reset + 1) is the authors' code's.
         """
@@ -103,6 +104,11 @@ class ARSConfig:
         n_reset = self.n_reset
         if n_reset is None:
             n_reset = 4 if n_tasks > 1 else 0
+        if n_reset >= max(total_timesteps, 1):
+            raise ConfigError(
+                f"n_reset asks for {n_reset} resets in {total_timesteps} steps; train longer, or reset less often "
+                "(n_reset=0 for never)."
+            )
         return [total_timesteps * (k + 1) // (n_reset + 1) for k in range(n_reset)]
 
 
@@ -123,7 +129,7 @@ class ExecutionConfig:
     def __post_init__(self) -> None:
         _check_choice("precision", self.precision, get_args(Precision))
         _check_choice("execution", self.execution, get_args(Execution))
-        if self.overlap not in (None, True, False):
+        if self.overlap is not None and not isinstance(self.overlap, bool):
             raise ConfigError(f"overlap={self.overlap!r} must be True, False or None.")
 
 
@@ -156,7 +162,7 @@ def _check_positive(option: str, value: object) -> None:
 
 
 def _check_choice(option: str, value: object, allowed: Sequence[str | None]) -> None:
-    if value not in allowed:
+    if not isinstance(value, str | None) or value not in allowed:
         names = [name for name in allowed if name is not None]
         raise ConfigError(
             f"{option}={value!r} is unknown; choose one of {names}." + nearest(str(value), names)

@@ -7,6 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
@@ -16,7 +17,7 @@ from tqdm.auto import tqdm
 
 from sb3_ars.envs import make_metaworld_env
 from sb3_ars.envs.metaworld import Goals
-from sb3_ars.errors import ConfigError, WorkerError, nearest
+from sb3_ars.errors import ConfigError, WorkerError, check_count, check_flag, nearest
 from sb3_ars.metrics import mean_success, success_rates
 
 __all__ = [
@@ -125,10 +126,13 @@ def get_protocol(protocol: str | EvaluationProtocol) -> EvaluationProtocol:
                 + nearest(protocol, PROTOCOLS)
             )
         return PROTOCOLS[protocol]
-    if protocol.n_episodes < 1:
+    if not isinstance(protocol, EvaluationProtocol):
         raise ConfigError(
-            f"protocol {protocol.name!r} has n_episodes={protocol.n_episodes}; it must be at least 1."
+            f"protocol={protocol!r} must be one of {sorted(PROTOCOLS)}, or an EvaluationProtocol."
         )
+    check_count(f"protocol {protocol.name!r}: n_episodes", protocol.n_episodes)
+    if protocol.max_episode_steps is not None:
+        check_count(f"protocol {protocol.name!r}: max_episode_steps", protocol.max_episode_steps)
     return protocol
 
 
@@ -173,6 +177,17 @@ def evaluate_tasks(
         horizon than the protocol
     """
     chosen = get_protocol(protocol)
+    if not callable(getattr(model, "predict", None)):
+        raise ConfigError(f"model={model!r} has no predict(); give a trained model or a loaded policy.")
+    for option, flag in (("deterministic", deterministic), ("progress_bar", progress_bar)):
+        check_flag(option, flag)
+    if check_count("seed", seed, minimum=0) > _MAX_SEED:
+        raise ConfigError(f"seed={seed!r} must be an integer of at most {_MAX_SEED}.")
+    if isinstance(env, gym.Env | gym.vector.VectorEnv):
+        raise ConfigError(
+            f"env={env!r} has no tasks; make the environment with make_multitask_env or make_metaworld_env, or give "
+            "the names of Meta-World tasks."
+        )
     if isinstance(env, VecEnv):
         return _evaluate(model, env, chosen, deterministic, seed, progress_bar)
     with closing(make_evaluation_env(env, chosen)) as own:
@@ -219,6 +234,7 @@ def _evaluate(
     return TaskEvaluation(protocol, tuple(task_names), deterministic, **columns)
 
 
+_MAX_SEED = 2**63 - 1  # torch takes no larger one
 _OUTCOMES = ("success_once", "success_at_end", "returns", "lengths")
 
 
@@ -256,6 +272,10 @@ def check_evaluation_env(model: Any, env: VecEnv, protocol: EvaluationProtocol) 
     :param protocol: its horizon and goals must be the environment's
     :raises ConfigError: naming what does not fit and the remedy
     """
+    if not isinstance(env, VecEnv):
+        raise ConfigError(
+            f"The evaluation environment {env!r} has no tasks; make it with make_metaworld_env or make_multitask_env."
+        )
     training_env: Any = getattr(model, "env", None)
     if training_env is not None and env.unwrapped is training_env.unwrapped:
         raise ConfigError(

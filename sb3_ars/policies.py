@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
-from sb3_ars.errors import ConfigError
+from sb3_ars.errors import ConfigError, check_count, check_flag
 from sb3_ars.nets.bodies import body_config, build_body
 from sb3_ars.nets.layers import ByTask
 from sb3_ars.nets.lora import LoRAConfig, LoRALinear, TaskOfRows, adapters, add_adapters, renew_adapters
@@ -242,12 +242,26 @@ class _PolicyOptions:
         for option, value, allowed in (
             ("std", std, ("exp", "softplus")),
             ("weight_init", weight_init, ("torch", "xavier")),
-            ("critic_layer_norm", critic_layer_norm, (False, True)),
         ):
             if value not in allowed:
                 raise ConfigError(
                     f"policy option {option}={value!r} is unknown; choose one of {list(allowed)}."
                 )
+        check_flag("policy option critic_layer_norm", critic_layer_norm)
+        for option, activation in (
+            ("activation_fn", activation_fn),
+            ("critic_activation_fn", critic_activation_fn),
+        ):
+            if activation is not None and not (
+                isinstance(activation, type) and issubclass(activation, nn.Module)
+            ):
+                raise ConfigError(
+                    f"policy option {option}={activation!r} must be a class of torch.nn, such as nn.ReLU, or None."
+                )
+        _check_net_arch(net_arch)
+        for option in ("n_critics", "n_quantiles"):
+            if option in kwargs:
+                check_count(f"policy option {option}", kwargs[option])
         # SB3 builds the networks inside __init__, so what they depend on is set first
         self.critic_layer_norm = critic_layer_norm
         self.std: StdParametrization = std
@@ -260,14 +274,17 @@ class _PolicyOptions:
         _check_bodies(self.body, self.critic_body, lora)
         self._given_activations = (activation_fn, critic_activation_fn)
         self._critic_activation_fn = critic_activation_fn or activation_fn or nn.Tanh
-        super().__init__(
-            observation_space,  # type: ignore[call-arg]  # SB3's policy comes next in the order of classes
-            action_space,
-            lr_schedule,
-            net_arch=net_arch,
-            activation_fn=activation_fn or nn.ReLU,
-            **kwargs,
-        )
+        try:
+            super().__init__(
+                observation_space,  # type: ignore[call-arg]  # SB3's policy comes next in the order of classes
+                action_space,
+                lr_schedule,
+                net_arch=net_arch,
+                activation_fn=activation_fn or nn.ReLU,
+                **kwargs,
+            )
+        except TypeError as error:  # a name that is no option, of the policy, its optimizer or its extractor
+            raise ConfigError(f"policy_kwargs={kwargs!r} make no policy: {error}.") from error
         if lora is not None:
             self.enable_lora(lora)
 
@@ -370,6 +387,22 @@ class _PolicyOptions:
             lora=self.lora,
         )
         return data
+
+
+def _check_net_arch(net_arch: Any) -> None:
+    """Refuse what is neither None, a list of widths, nor one for each of actor (pi) and critics (qf)."""
+    arches = net_arch.values() if isinstance(net_arch, Mapping) else [net_arch]
+    if isinstance(net_arch, Mapping) and set(net_arch) != {"pi", "qf"}:
+        raise ConfigError(
+            f"policy option net_arch={net_arch!r} must have the keys 'pi' and 'qf', or be a list."
+        )
+    for arch in arches:
+        if arch is not None and not isinstance(arch, list if arch is net_arch else list | tuple):
+            raise ConfigError(
+                f"policy option net_arch={net_arch!r} must be a list of widths, such as [400, 400]."
+            )
+        for width in arch or ():
+            check_count("policy option net_arch entry", width)
 
 
 def _check_bodies(

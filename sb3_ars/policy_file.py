@@ -30,8 +30,9 @@ from torch import nn
 from sb3_ars import __version__
 from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.algorithms.sac import ARSSAC
+from sb3_ars.algorithms.sb3_options import check_sb3_options
 from sb3_ars.algorithms.tqc import ARSTQC
-from sb3_ars.errors import ConfigError
+from sb3_ars.errors import ConfigError, check_path
 from sb3_ars.files import write_whole
 from sb3_ars.nets.bodies import body_config
 from sb3_ars.nets.lora import LoRAConfig
@@ -118,7 +119,7 @@ def export_policy(model: MultiTaskOffPolicyAlgorithm, path: str | Path, with_cri
     :raises ConfigError: for a policy that tensors and JSON cannot express, one that holds NaN or infinity, or if the
         file cannot be written
     """
-    path = Path(path)
+    path = check_path("path", path)
     path = path if path.suffix else path.with_name(path.name + SUFFIX)
     if path.suffix != SUFFIX:
         raise ConfigError(f"A policy is exported to a file named *{SUFFIX}, not to {path.name}.")
@@ -158,7 +159,8 @@ def load_policy(path: str | Path, device: th.device | str = "auto") -> LoadedPol
     :param device: SB3's
     :raises ConfigError: if it is missing, is no such file, or is damaged, saying what is wrong with it
     """
-    path = Path(path)
+    path = check_path("path", path)
+    check_sb3_options({"device": device})
     device = get_device(device)
     try:
         if not path.is_file():  # a pipe has no end

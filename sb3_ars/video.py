@@ -95,6 +95,8 @@ def record_episodes(
     :param caption: whether the frames say task, step and success
     :raises ConfigError: for an unknown task, an environment that does not render, or a machine that cannot draw
     """
+    if env is not None and not isinstance(env, VecEnv):
+        raise ConfigError(f"env={env!r} must be an environment with tasks, such as make_toy_env's, or None.")
     if env is not None:
         return _record(model, task, env, n_episodes, deterministic, seed, fps, caption)
     names = getattr(model, "task_names", None)

@@ -155,7 +155,7 @@ def test_horizons_shorter_than_the_scales_stay(tmp_path):
         ({"resets_at": [1.5]}, "resets_at entry=1.5 must be a share of the run"),
         ({"resets_until": 0}, "resets_until=0 must be a share of the run"),
         ({"at_most": {"hidden_widht": 3}}, "at_most has no cap 'hidden_widht'.*Did you mean 'hidden_width'"),
-        ({"at_most": {"rank": -1}}, "at_most rank=-1 must be a number of at least 0"),
+        ({"at_most": {"rank": -1}}, "at_most rank=-1 must be an integer of at least 1"),
         ({"options": {"algorithm": {"lerning_rate": 1}}}, "'lerning_rate' is no option of AlgorithmConfig"),
         ({"options": {"ars": {"n_reset": 2}}}, "ars.n_reset is no scale's to set"),
         ({"options": {"seed": 2}}, "seed is no scale's to set"),

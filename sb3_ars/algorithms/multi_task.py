@@ -5,6 +5,7 @@ Arithmetic lives in ``sb3_ars.core``; what happens when is ``ARSCallback``'s to 
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import pathlib
@@ -39,6 +40,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_ars.algorithms.checkpoint import RowsOnDisk, model_of_checkpoint
 from sb3_ars.algorithms.execution import CapturedActor, ExecutionPlan, WorkWhileStepping, plan_execution
 from sb3_ars.algorithms.run_state import restore_pending
+from sb3_ars.algorithms.sb3_options import check_env, check_policy, check_sb3_options
 from sb3_ars.algorithms.task_log import TaskLog
 from sb3_ars.buffers import TaskReplayBuffer
 from sb3_ars.callbacks.ars import ARSCallback
@@ -59,7 +61,15 @@ from sb3_ars.core.reward_scale import RewardScale, RewardStatistics, parse_rewar
 from sb3_ars.core.runner import CapturedCalls, compiled, prepare_optimizer_, tf32
 from sb3_ars.core.update import Hyperparameters, Metrics, Noise, Timer, UpdateState, update
 from sb3_ars.envs import make_multitask_env
-from sb3_ars.errors import ConfigError, DivergedError, EnvContractError, check_count
+from sb3_ars.errors import (
+    ConfigError,
+    DivergedError,
+    EnvContractError,
+    check_count,
+    check_flag,
+    check_path,
+    nearest,
+)
 from sb3_ars.nets.layers import ByTask
 from sb3_ars.nets.lora import LoRAConfig, layers_to_adapt
 from sb3_ars.nets.mlp import set_arithmetic
@@ -192,7 +202,38 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         max_task_loss: float | None = None,
         lora: dict[str, Any] | None = None,
     ) -> None:
-        if "lora" in (policy_kwargs or {}):
+        check_policy(policy, self.policy_aliases)
+        check_env(env)
+        options: dict[str, Any] = {
+            "learning_rate": learning_rate,
+            "buffer_size": buffer_size,
+            "batch_size": batch_size,
+            "tau": tau,
+            "gamma": gamma,
+            "train_freq": train_freq,
+            "gradient_steps": gradient_steps,
+            "action_noise": action_noise,
+            "replay_buffer_class": replay_buffer_class,
+            "replay_buffer_kwargs": replay_buffer_kwargs,
+            "optimize_memory_usage": optimize_memory_usage,
+            "n_steps": n_steps,
+            "ent_coef": ent_coef,
+            "target_update_interval": target_update_interval,
+            "target_entropy": target_entropy,
+            "use_sde": use_sde,
+            "sde_sample_freq": sde_sample_freq,
+            "use_sde_at_warmup": use_sde_at_warmup,
+            "stats_window_size": stats_window_size,
+            "tensorboard_log": tensorboard_log,
+            "policy_kwargs": policy_kwargs,
+            "verbose": verbose,
+            "seed": seed,
+            "device": device,
+        }
+        check_sb3_options(options)
+        # SB3 2.9.2 writes into the caller's (off_policy_algorithm.py)
+        options |= {name: dict(options[name] or {}) for name in ("replay_buffer_kwargs", "policy_kwargs")}
+        if "lora" in options["policy_kwargs"]:
             raise ConfigError(
                 f"lora belongs to {type(self).__name__}'s own arguments, not to policy_kwargs: there it would freeze "
                 "networks that have learned nothing."
@@ -215,34 +256,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]  # None is SB3's way to load without an environment
-            learning_rate,
-            buffer_size,
-            0 if is_auto else learning_starts,  # type: ignore[arg-type]  # _is_auto leaves an integer
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            ent_coef=ent_coef,  # type: ignore[call-arg]  # SAC or TQC comes next in the order of classes
-            target_update_interval=target_update_interval,
-            target_entropy=target_entropy,
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            use_sde_at_warmup=use_sde_at_warmup,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=dict(
-                policy_kwargs or {}
-            ),  # SB3 2.9.2 writes into the caller's (off_policy_algorithm.py)
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            _init_setup_model=False,
+            learning_starts=0 if is_auto else learning_starts,  # type: ignore[arg-type]  # _is_auto leaves an integer
+            **options,
+            _init_setup_model=False,  # type: ignore[call-arg]  # SAC or TQC comes next in the order of classes
         )
         self.__dict__.update(vars(config), **vars(execution_config))
         self.timer = nullcontext
@@ -316,25 +332,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         return len(self.task_names) if self.task_names else 1
 
     def _check_options(self) -> None:
+        # again, for load() replaces attributes
+        check_sb3_options({**vars(self), "stats_window_size": self._stats_window_size})
         if self.use_sde:
             raise ConfigError(
                 "use_sde=True (gSDE) is not supported: the update draws plain Gaussian noise. Use False."
-            )
-        for option in ("batch_size", "buffer_size", "target_update_interval"):
-            check_count(option, getattr(self, option))
-        check_count("stats_window_size", self._stats_window_size)
-        for option, value in (("gamma", self.gamma), ("tau", self.tau)):
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
-                raise ConfigError(f"{option}={value!r} must be between 0 and 1.")
-        if not callable(self.learning_rate) and not self.learning_rate >= 0:
-            raise ConfigError(
-                f"learning_rate={self.learning_rate!r} must be a number of at least 0, or a schedule."
-            )
-        ent_coef = self.ent_coef  # type: ignore[attr-defined]  # SAC's and TQC's
-        is_auto = isinstance(ent_coef, str) and ent_coef.split("_")[0] == "auto"
-        if not is_auto and (isinstance(ent_coef, str) or not ent_coef >= 0):
-            raise ConfigError(
-                f"ent_coef={ent_coef!r} must be 'auto', 'auto_' and a first value, or a number from 0."
             )
         if not issubclass(self.policy_class, self.policy_aliases["MlpPolicy"]):
             raise ConfigError(
@@ -439,6 +441,13 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         wanted += ["task_weighting"] if self.task_weighting != "equal" else []
         wanted += ["max_task_loss"] if self.max_task_loss is not None else []
         wanted += ["lora"] if self.lora is not None else []
+        keeps_timeouts = self.replay_buffer_kwargs.get("handle_timeout_termination", True)
+        if self.optimize_memory_usage and keeps_timeouts and self.replay_buffer_class is None:
+            raise ConfigError(
+                "optimize_memory_usage=True with a plain environment is SB3's, which needs "
+                "replay_buffer_kwargs={'handle_timeout_termination': False}; give that, or an environment with named "
+                "tasks."
+            )
         if wanted:
             raise ConfigError(
                 f"{wanted[0]} needs an environment with named tasks; make it with make_multitask_env or "
@@ -449,7 +458,8 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         return self.replay_buffer_class is None or issubclass(self.replay_buffer_class, TaskReplayBuffer)
 
     def _make_task_buffer(self, buffer_class: Any) -> ReplayBuffer:
-        buffer: ReplayBuffer = buffer_class(
+        make = partial(
+            buffer_class,
             self.buffer_size,
             self.observation_space,
             self.action_space,
@@ -460,8 +470,18 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
             task_names=self.task_names,
             seed=self.seed,
             verbose=self.verbose,
-            **self.replay_buffer_kwargs,
         )
+        ours = [name for name in self.replay_buffer_kwargs if name in make.keywords]
+        if ours:
+            raise ConfigError(
+                f"replay_buffer_kwargs sets {', '.join(ours)}, which {type(self).__name__} does itself; leave it out."
+            )
+        try:
+            buffer: ReplayBuffer = make(**self.replay_buffer_kwargs)
+        except TypeError as error:
+            raise ConfigError(
+                f"replay_buffer_kwargs={self.replay_buffer_kwargs!r} do not fit {buffer_class.__name__}: {error}."
+            ) from error
         return buffer
 
     def _make_temperature_per_task(self, log_ent_coef: th.Tensor) -> None:
@@ -504,6 +524,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Make networks and optimizers ready for how updates are executed; again after anything replaced them."""
         train_freq: Any = self.train_freq  # a TrainFreq since SB3's _setup_model
         by_step = train_freq.unit == TrainFrequencyUnit.STEP
+        if not by_step and self.n_envs > 1:
+            raise ConfigError(
+                f"train_freq=({train_freq.frequency}, 'episode') needs a single environment, and here are "
+                f"{self.n_envs}, whose episodes end apart; give it in steps."
+            )
         if self.overlap and not by_step:
             raise ConfigError(
                 "overlap=True needs train_freq in steps: how many updates an episode is worth is known when it ends."
@@ -534,6 +559,9 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param force_reset: whether the next ``learn`` resets it first
         :raises ConfigError: if its tasks differ
         """
+        if env is None:
+            raise ConfigError("env=None: set_env needs an environment with the model's tasks.")
+        check_env(env)
         wrapped = self._wrap_env(env, self.verbose)
         if task_names_of(wrapped) != self.task_names:
             raise ConfigError(
@@ -556,6 +584,10 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param tasks: names or indices; ``None`` is all
         :raises ConfigError: for an unknown task, none at all, or an environment that can only step as a whole
         """
+        if tasks is not None and (isinstance(tasks, str) or not isinstance(tasks, Sequence)):
+            raise ConfigError(
+                f"tasks={tasks!r} must be a list of tasks, such as [{tasks!r}], or None for all."
+            )
         indices = None if tasks is None else sorted({task_index(task, self.task_names) for task in tasks})
         if indices == []:
             raise ConfigError(
@@ -614,6 +646,11 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :raises ConfigError: before the first step, if the options do not fit the run
         """
         _check_learn(total_timesteps, log_interval)
+        _check_callback(callback)
+        for option, flag in (("reset_num_timesteps", reset_num_timesteps), ("progress_bar", progress_bar)):
+            check_flag(option, flag)
+        if not isinstance(tb_log_name, str | None):
+            raise ConfigError(f"tb_log_name={tb_log_name!r} must be the name of a TensorBoard run, or None.")
         try:
             super().learn(
                 total_timesteps=int(total_timesteps),
@@ -1115,11 +1152,16 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param path: what ``save`` wrote
         :param env: an environment with the same tasks in the same order, or ``None`` for prediction alone
         :param kwargs: SB3's further arguments, or options to replace
-        :raises ConfigError: if the environment has other tasks
+        :raises ConfigError: if the environment has other tasks, the file holds no model, or there is no such option
         """
+        _check_option_names(cls, kwargs)
+        check_env(env)
+        if not hasattr(path, "read"):
+            check_path("path", path)
+        saved = _saved_task_names(path)
         if env is not None:
             env = cls._wrap_env(env)
-            _check_saved_tasks(path, task_names_of(env))
+            _check_saved_tasks(path, saved, task_names_of(env))
         return super().load(path, env=env, **kwargs)
 
     @classmethod
@@ -1137,8 +1179,13 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param env: made with the same arguments as the run's; ``n_workers`` may differ
         :param options: of the constructor, in the place of those that were saved, such as ``device``
         :raises CheckpointError: if no checkpoint is whole, it is another algorithm's, or other tasks'
+        :raises ConfigError: if there is no such option, or it cannot work
         """
-        return model_of_checkpoint(cls, path, env, options)
+        if env is None:
+            raise ConfigError("env=None: a run goes on in an environment; make it as the run's was.")
+        check_env(env)
+        _check_option_names(cls, options)
+        return model_of_checkpoint(cls, check_path("path", path), env, options)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Save the replay buffer, as SB3 does; with several tasks straight from memory, without a second copy.
@@ -1200,10 +1247,23 @@ class MultiTaskOffPolicyAlgorithm(OffPolicyAlgorithm):
 
 def _check_learn(total_timesteps: Any, log_interval: Any) -> None:
     is_number = isinstance(total_timesteps, int | float | np.number) and not isinstance(total_timesteps, bool)
-    if not is_number or not 0 <= total_timesteps < float("inf"):
-        raise ConfigError(f"total_timesteps={total_timesteps!r} must be a number of environment steps.")
+    if not is_number or not 0 <= total_timesteps < float("inf") or total_timesteps != int(total_timesteps):
+        raise ConfigError(f"total_timesteps={total_timesteps!r} must be a whole number of environment steps.")
     if log_interval is not None:
         check_count("log_interval", log_interval)
+
+
+def _check_callback(callback: Any) -> None:
+    """Refuse what SB3 would find out to be no callback at the first step."""
+    is_function = callable(callback) and not isinstance(callback, type)
+    if callback is None or is_function:
+        return
+    for each in callback if isinstance(callback, list) else [callback]:
+        if not isinstance(each, BaseCallback):
+            hint = " Call the class: give what it returns." if isinstance(each, type) else ""
+            raise ConfigError(
+                f"callback={each!r} must be a callback of SB3's, a list of them, a function or None.{hint}"
+            )
 
 
 def task_names_of(env: GymEnv) -> list[str] | None:
@@ -1223,20 +1283,34 @@ def _opened(path: str | pathlib.Path | io.BufferedIOBase, mode: str, verbose: in
             file.close()
 
 
-def _check_saved_tasks(path: str | pathlib.Path | io.BufferedIOBase, names: list[str] | None) -> None:
-    """Name the tasks before SB3 compares spaces, whose error shows two boxes of numbers."""
+def _check_option_names(cls: type[Any], options: Mapping[str, Any]) -> None:
+    """Refuse a misspelt option, which SB3 would keep as an attribute that nobody reads."""
+    known = [name for c in (cls, MultiTaskOffPolicyAlgorithm) for name in inspect.signature(c).parameters]
+    known = [name for name in known if name not in ("args", "kwargs")]
+    for name in options:
+        if name not in (*known, "custom_objects", "print_system_info", "force_reset"):
+            raise ConfigError(f"{name!r} is no option of {cls.__name__}.{nearest(name, known)}")
+
+
+def _saved_task_names(path: str | pathlib.Path | io.BufferedIOBase) -> list[str] | None:
+    """Return the tasks of a saved model, ``None`` for one of a plain environment."""
     file = open_path(path, "r", verbose=0, suffix="zip")
     start = file.tell()
     try:
         with zipfile.ZipFile(file) as archive:
-            saved = json.loads(archive.read("data")).get("task_names")
-    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+            names: list[str] | None = json.loads(archive.read("data")).get("task_names")
+            return names
+    except (zipfile.BadZipFile, KeyError, ValueError, AttributeError) as error:
         raise ConfigError(f"{path} is not a saved model ({error}).") from error
     finally:
         if file is path:
             file.seek(start)
         else:
             file.close()
+
+
+def _check_saved_tasks(path: Any, saved: list[str] | None, names: list[str] | None) -> None:
+    """Name the tasks before SB3 compares spaces, whose error shows two boxes of numbers."""
     if saved != names:
         raise ConfigError(
             f"{path} was trained on {_describe(saved)}, but the environment has {_describe(names)}. Make the "

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_ars.errors import ConfigError
+from sb3_ars.errors import ConfigError, check_verbose
 from sb3_ars.nets.lora import LoRAConfig
 
 if TYPE_CHECKING:
@@ -29,13 +29,20 @@ class ARSCallback(BaseCallback):
     """
 
     def __init__(self, verbose: int = 0) -> None:
-        super().__init__(verbose)
+        super().__init__(check_verbose("verbose", verbose))
         self.reset_times: list[int] = []
 
     @property
     def algorithm(self) -> MultiTaskOffPolicyAlgorithm:
         """The model, typed."""
         return cast("MultiTaskOffPolicyAlgorithm", self.model)
+
+    def _init_callback(self) -> None:
+        if not hasattr(self.model, "reward_scale_history"):
+            raise ConfigError(
+                f"{type(self).__name__} is the bookkeeping of ARSSAC and ARSTQC; a {type(self.model).__name__} scales "
+                "no rewards and has no resets. Leave it out, or train one of those."
+            )
 
     def _on_training_start(self) -> None:
         model = self.algorithm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
@@ -19,7 +20,7 @@ from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
 from sb3_ars.algorithms.run_state import check_can_be_captured
 from sb3_ars.checkpoints import CheckpointFolder, checkpoint_folders, lock
 from sb3_ars.config import CheckpointConfig
-from sb3_ars.errors import ConfigError
+from sb3_ars.errors import ConfigError, check_flag, check_path, check_verbose
 
 __all__ = ["RunCheckpoint"]
 
@@ -56,15 +57,23 @@ class RunCheckpoint(BaseCallback):
         files: Sequence[str | Path] = (),
         verbose: int = 0,
     ) -> None:
-        super().__init__(verbose)
+        super().__init__(check_verbose("verbose", verbose))
         self.options = CheckpointConfig(every, every_minutes, keep)
+        self.handle_signals = check_flag("handle_signals", handle_signals)
         if every is None and every_minutes is None and not handle_signals:
             raise ConfigError(
                 "every=None, every_minutes=None and handle_signals=False would never write a checkpoint."
             )
-        self.folder = Path(folder)
-        self.handle_signals = handle_signals
-        self.notes, self.files = dict(notes or {}), [Path(file) for file in files]
+        try:
+            dict(notes or {}), json.dumps(notes, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"notes={notes!r} must be a mapping of plain values, or None: {error}."
+            ) from error
+        if isinstance(files, str) or not isinstance(files, Sequence):
+            raise ConfigError(f"files={files!r} must be a list of paths.")
+        self.folder = check_path("folder", folder)
+        self.notes, self.files = dict(notes or {}), [check_path("files entry", file) for file in files]
         names = [file.name for file in self.files]
         taken = {"state.pt", "manifest.json"} & set(names)
         if taken or len(set(names)) < len(names):

@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_ars.errors import check_count
+from sb3_ars.errors import ConfigError, check_count, check_flag, check_path, check_verbose
 from sb3_ars.evaluation import (
     EvaluationProtocol,
     TaskEvaluation,
@@ -39,7 +39,7 @@ class TaskEvalCallback(EventCallback):
     :param callback_on_new_best: SB3's
     :param callback_after_eval: SB3's
     :param verbose: 1 prints each evaluation's mean success
-    :raises ConfigError: if ``eval_freq`` is not a positive integer or the protocol is unknown
+    :raises ConfigError: if an option cannot work, such as an unknown protocol
     """
 
     def __init__(
@@ -54,13 +54,25 @@ class TaskEvalCallback(EventCallback):
         callback_after_eval: BaseCallback | None = None,
         verbose: int = 0,
     ) -> None:
-        super().__init__(callback_after_eval, verbose=verbose)
+        for option, callback in (
+            ("callback_on_new_best", callback_on_new_best),
+            ("callback_after_eval", callback_after_eval),
+        ):
+            if callback is not None and not isinstance(callback, BaseCallback):
+                raise ConfigError(f"{option}={callback!r} must be a callback of SB3's, or None.")
+        super().__init__(callback_after_eval, verbose=check_verbose("verbose", verbose))
+        if not isinstance(eval_env, VecEnv):
+            raise ConfigError(
+                f"eval_env={eval_env!r} must be an environment with tasks, such as make_metaworld_env's."
+            )
         self.eval_env = eval_env
         self.eval_freq = check_count("eval_freq", eval_freq)
         self.protocol = get_protocol(protocol)
-        self.deterministic = deterministic
-        self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
-        self.log_path = None if log_path is None else Path(log_path)
+        self.deterministic = check_flag("deterministic", deterministic)
+        self.best_model_save_path = (
+            None if best_model_save_path is None else check_path("best_model_save_path", best_model_save_path)
+        )
+        self.log_path = None if log_path is None else check_path("log_path", log_path)
         self.callback_on_new_best = callback_on_new_best
         self.best_score = -np.inf
         self.history: list[tuple[int, TaskEvaluation]] = []

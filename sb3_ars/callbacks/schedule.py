@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_ars.callbacks.ars import update_scale_and_networks
 from sb3_ars.core.schedule import POOLS, SMTConfig, SMTSchedule
-from sb3_ars.errors import ConfigError, EnvContractError
+from sb3_ars.errors import ConfigError, EnvContractError, check_verbose
 
 if TYPE_CHECKING:
     from sb3_ars.algorithms.multi_task import MultiTaskOffPolicyAlgorithm
@@ -38,7 +38,7 @@ class TaskScheduleCallback(BaseCallback):
     """
 
     def __init__(self, config: SMTConfig | None = None, verbose: int = 0) -> None:
-        super().__init__(verbose)
+        super().__init__(check_verbose("verbose", verbose))
         if config is not None and not isinstance(config, SMTConfig):
             raise ConfigError(f"config={config!r} must be an SMTConfig, such as SMTConfig(pool_size=3).")
         self.config = config or SMTConfig()
@@ -49,6 +49,13 @@ class TaskScheduleCallback(BaseCallback):
     def algorithm(self) -> MultiTaskOffPolicyAlgorithm:
         """The model, typed."""
         return cast("MultiTaskOffPolicyAlgorithm", self.model)
+
+    def _init_callback(self) -> None:
+        if not hasattr(self.model, "schedule_state"):
+            raise ConfigError(
+                f"TaskScheduleCallback chooses among the tasks of ARSSAC and ARSTQC; a {type(self.model).__name__} has "
+                "none. Leave it out, or train one of those."
+            )
 
     def _on_training_start(self) -> None:
         if (

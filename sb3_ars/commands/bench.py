@@ -17,6 +17,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
+from sb3_ars.commands.arguments import read_arguments
 from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.cells import Cell, CellState, cell_state, clean, failed_folder, plan
 from sb3_ars.experiments.launchers import Launcher, LocalLauncher, Monitor, Outcome, RayLauncher
@@ -68,7 +69,7 @@ def main(arguments: list[str]) -> int:
     if not arguments:
         _print_catalogue()
         return 0
-    options = tyro.cli(_BenchArguments, prog="sb3-ars bench", args=arguments)
+    options = read_arguments(_BenchArguments, "sb3-ars bench", arguments)
     if not options.tables:
         raise ConfigError(f"Name the tables or figures to train: {', '.join(sweep_names())}.")
     sweeps = [load_sweep(name) for name in options.tables]

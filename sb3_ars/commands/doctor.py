@@ -7,6 +7,8 @@ import json
 import sys
 from typing import Any
 
+from sb3_ars.errors import ConfigError
+
 __all__ = ["main"]
 
 _USAGE = """sb3-ars doctor [--json]
@@ -26,9 +28,11 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
-    if arguments not in ([], ["--json"]):
+    if arguments[:1] in (["-h"], ["--help"]):
         print(_USAGE)
-        return 0 if arguments[0] in ("-h", "--help") else 2
+        return 0
+    if arguments not in ([], ["--json"]):
+        raise ConfigError(f"sb3-ars doctor takes --json or nothing, not {' '.join(arguments)!r}.")
     # Not above: whichever package is missing, this is the command that is asked about it.
     try:
         from rich.console import Console

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from sb3_ars.commands.arguments import read_arguments
 from sb3_ars.commands.tables import print_evaluation
 
 __all__ = ["main"]
@@ -28,7 +29,7 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
-    options = tyro.cli(_EvaluateArguments, prog="sb3-ars evaluate", args=arguments)
+    options = read_arguments(_EvaluateArguments, "sb3-ars evaluate", arguments)
     # after the options are read: it loads torch
     from sb3_ars.experiments.runner import evaluate_run
 

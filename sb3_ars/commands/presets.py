@@ -7,6 +7,7 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
+from sb3_ars.errors import ConfigError
 from sb3_ars.experiments import find_presets, preset_group, preset_info
 
 __all__ = ["main"]
@@ -17,9 +18,12 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
-    if any(argument.startswith("-") for argument in arguments):
+    if arguments[:1] in (["-h"], ["--help"]):
         print("sb3-ars list [WORD ...] shows the presets, or those with every word in their names.")
-        return 0 if arguments[0] in ("-h", "--help") else 2
+        return 0
+    options = [argument for argument in arguments if argument.startswith("-")]
+    if options:
+        raise ConfigError(f"sb3-ars list takes words, not {options[0]!r}, such as 'sb3-ars list mt50 moore'.")
     table = Table(box=None, padding=(0, 1, 0, 0))
     table.add_column("preset", no_wrap=True)
     table.add_column("what it is")

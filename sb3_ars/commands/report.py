@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from sb3_ars.commands.arguments import read_arguments
+
 __all__ = ["main"]
 
 
@@ -30,7 +32,7 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
-    options = tyro.cli(_ReportArguments, prog="sb3-ars report", args=arguments)
+    options = read_arguments(_ReportArguments, "sb3-ars report", arguments)
     from sb3_ars.experiments.report import write_report  # after the options are read: it loads much
 
     page = write_report(options.runs, options.output, options.sweeps, options.videos)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from sb3_ars.commands.arguments import read_arguments
 from sb3_ars.commands.tables import print_evaluation
+from sb3_ars.errors import ConfigError
 from sb3_ars.experiments.config import RunConfig, load_config, load_preset
 from sb3_ars.profiling import PARTS
 
@@ -31,19 +32,23 @@ def main(arguments: list[str]) -> int:
     """
     if arguments and arguments[0] == "--resume":
         return _resume(arguments[1:])
-    if not arguments or arguments[0].startswith("-"):
+    if not arguments or arguments[0] in ("-h", "--help"):
         print(_USAGE)
-        return 0 if arguments and arguments[0] in ("-h", "--help") else 2
+        return 0 if arguments else 2
+    if arguments[0].startswith("-"):
+        raise ConfigError(
+            f"sb3-ars train takes a PRESET before {arguments[0]}, such as toy; 'sb3-ars list' shows the presets."
+        )
     given, *rest = arguments
     path = Path(given)
     is_file = path.suffix in (".yaml", ".yml")
     name = path.stem if is_file else given
-    config = tyro.cli(
+    config = read_arguments(
         RunConfig,
-        prog=f"sb3-ars train {given}",
+        f"sb3-ars train {given}",
+        rest,
         description=f"Train {given}; the defaults shown are its own.",
         default=load_config(path) if is_file else load_preset(name),
-        args=rest,
     )
     # after the options are read: it loads torch, and a mistake or --help should not wait for that
     from sb3_ars.experiments.runner import train
@@ -56,11 +61,12 @@ def main(arguments: list[str]) -> int:
 
 
 def _resume(arguments: list[str]) -> int:
+    usage = "sb3-ars train --resume takes one argument, the folder of a run; its options are those in its config.yaml."
+    if arguments in (["-h"], ["--help"]):
+        print(usage)
+        return 0
     if len(arguments) != 1 or arguments[0].startswith("-"):
-        print(
-            "sb3-ars train --resume takes one argument, the folder of a run; its options are those in its config.yaml."
-        )
-        return 0 if arguments in (["-h"], ["--help"]) else 2
+        raise ConfigError(usage)
     from sb3_ars.experiments.runner import resume  # loads torch
 
     _show(resume(Path(arguments[0])))

@@ -13,6 +13,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from sb3_ars.commands.arguments import read_arguments
+
 if TYPE_CHECKING:
     import optuna
     from optuna.trial import FrozenTrial
@@ -61,7 +63,7 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
-    options = tyro.cli(_TuneArguments, prog="sb3-ars tune", description=_DESCRIPTION, args=arguments)
+    options = read_arguments(_TuneArguments, "sb3-ars tune", arguments, description=_DESCRIPTION)
     # after the options are read: it loads torch
     from sb3_ars.tuning import summarise, tune, unused_seed, write_results
 

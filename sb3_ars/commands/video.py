@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sb3_ars.commands.arguments import read_arguments
+
 if TYPE_CHECKING:
     from sb3_ars.video import Recording
 
@@ -46,7 +48,7 @@ def main(arguments: list[str]) -> int:
 
     :param arguments: behind the command's name
     """
-    options = tyro.cli(_VideoArguments, prog="sb3-ars video", description=_DESCRIPTION, args=arguments)
+    options = read_arguments(_VideoArguments, "sb3-ars video", arguments, description=_DESCRIPTION)
     # after the options are read: it loads torch
     from sb3_ars.video import record_run
 

@@ -198,7 +198,10 @@ def check_task_of_env(value: Sequence[int] | npt.NDArray[np.int64], n_envs: int)
 
     :raises ConfigError: unless there is one index per env and every task from 0 on has an env
     """
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of unequal lengths
+        array = np.empty(0)
     if array.shape != (n_envs,) or not np.issubdtype(array.dtype, np.integer):
         raise ConfigError(
             f"task_of_env must hold one integer (a task index) for each of the {n_envs} envs, got {value!r}."

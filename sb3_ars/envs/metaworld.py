@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from sb3_ars.envs.rendering import DEFAULT_CAMERA, MujocoCamera, select_gl_backend
+from sb3_ars.envs.rendering import DEFAULT_CAMERA, MujocoCamera, camera_index, select_gl_backend
 from sb3_ars.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ class MetaworldTask(gym.Env[npt.NDArray[np.float64], npt.NDArray[np.float32]]):
             self.task, fast, reward_function_version=reward_version, render_mode=render_mode
         )
         """The stock env, or the fast subclass of it."""
+        camera_index(self.sawyer.model, camera)  # an unknown one is refused now, not when it is to draw
         self.sawyer._partially_observable = False
         # Cached while the goal was still hidden.
         del self.sawyer.sawyer_observation_space

@@ -61,6 +61,21 @@ def select_gl_backend() -> str:
     return backend
 
 
+def camera_index(model: Any, camera: str) -> int:
+    """Return MuJoCo's index of a camera, -1 for `DEFAULT_CAMERA`, which stands free.
+
+    :param model: MuJoCo's
+    :param camera: `DEFAULT_CAMERA`, or the name of one of the model's
+    :raises ConfigError: for an unknown camera
+    """
+    names = [DEFAULT_CAMERA, *(model.camera(index).name for index in range(model.ncam))]
+    if camera not in names:
+        raise ConfigError(
+            f"camera={camera!r} is unknown; choose one of {', '.join(names)}." + nearest(camera, names)
+        )
+    return names.index(camera) - 1
+
+
 class MujocoCamera:
     """Draws a MuJoCo model; what a camera that hangs upside down sees, as Meta-World's in the corners do, is turned.
 
@@ -76,12 +91,7 @@ class MujocoCamera:
         import mujoco
         from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
 
-        names = [DEFAULT_CAMERA, *(model.camera(index).name for index in range(model.ncam))]
-        if camera not in names:
-            raise ConfigError(
-                f"camera={camera!r} is unknown; choose one of {', '.join(names)}." + nearest(camera, names)
-            )
-        self._index = names.index(camera) - 1  # -1: ours, which stands free
+        self._index = camera_index(model, camera)
         self._data = data
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size)
         model.vis.global_.offheight = max(model.vis.global_.offheight, size)

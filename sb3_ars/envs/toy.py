@@ -219,7 +219,9 @@ def _frame(
     return np.asarray(image.resize((size, size), Image.Resampling.LANCZOS))
 
 
-def _check_tasks(tasks: Sequence[str], names: Sequence[str]) -> Sequence[str]:
+def _check_tasks(tasks: Any, names: Sequence[str]) -> Sequence[str]:
+    if isinstance(tasks, str) or not isinstance(tasks, Sequence):
+        raise ConfigError(f"tasks={tasks!r} must be a list of toy tasks' names, such as {list(names[:1])}.")
     for name in tasks:
         if name not in names:
             raise ConfigError(
@@ -230,13 +232,19 @@ def _check_tasks(tasks: Sequence[str], names: Sequence[str]) -> Sequence[str]:
     return tasks
 
 
-def _check_scales(reward_scales: Sequence[float]) -> list[float]:
-    if not isinstance(reward_scales, Sequence):
+def _is_positive(value: Any) -> bool:
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+    )
+
+
+def _check_scales(reward_scales: Any) -> list[float]:
+    if isinstance(reward_scales, str) or not isinstance(reward_scales, Sequence):
         raise ConfigError(
             f"reward_scales={reward_scales!r} must be a list of positive numbers, one per task."
         )
     scales = list(reward_scales)
-    if not 1 <= len(scales) <= 360 or any(not (math.isfinite(scale) and scale > 0) for scale in scales):
+    if not 1 <= len(scales) <= 360 or not all(map(_is_positive, scales)):
         raise ConfigError(
             f"reward_scales must hold 1 to 360 positive numbers, one per task, got {reward_scales!r}."
         )

@@ -378,6 +378,7 @@ def make_multitask_env(
         "max_episode_steps": (max_episode_steps, None),
         "n_workers": (n_workers, "auto"),
         "start_method": (start_method, "spawn"),
+        "worker_timeout": (worker_timeout, 25.0),
         "restart_workers": (restart_workers, False),
     }
     if ready_made:

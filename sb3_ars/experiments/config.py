@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 import yaml
@@ -15,7 +17,7 @@ from sb3_ars.config import ARSConfig, CheckpointConfig, Execution, Precision
 from sb3_ars.core.schedule import SMTConfig
 from sb3_ars.envs.metaworld import metaworld_task_names
 from sb3_ars.envs.toy import TOY_TASKS
-from sb3_ars.errors import ConfigError, check_count, nearest
+from sb3_ars.errors import ConfigError, check_count, check_path, nearest
 from sb3_ars.experiments.catalogue import preset_values
 
 __all__ = [
@@ -26,7 +28,9 @@ __all__ = [
     "PolicyConfig",
     "RunConfig",
     "ScheduleConfig",
+    "admits",
     "build",
+    "describe",
     "load_config",
     "load_preset",
     "plain_values",
@@ -260,6 +264,7 @@ def load_config(path: Path) -> RunConfig:
     :param path: its ``config.yaml``
     :raises ConfigError: if the file is missing, is no mapping, or holds an unknown key
     """
+    path = check_path("path", path)
     if not path.is_file():
         raise ConfigError(f"{path} does not exist; the folder of a run holds one, config.yaml.")
     values = read_yaml(path, str(path))
@@ -331,7 +336,7 @@ def build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: {cls.__name__} must be a mapping of options, not {values!r}.")
     hints = get_type_hints(cls)
-    kwargs = {}
+    kwargs: dict[str, Any] = {}
     for key, value in values.items():
         if key not in hints:
             raise ConfigError(
@@ -345,12 +350,59 @@ def build(cls: type[Config], values: Mapping[str, Any], where: str) -> Config:
                 + nearest(str(value), allowed)
             )
         if dataclasses.is_dataclass(hints[key]):
-            kwargs[key] = build(hints[key], value or {}, where)
-        elif hints[key] is Path:
+            kwargs[key] = build(hints[key], {} if value is None else value, where)
+        elif hints[key] is Path and isinstance(value, str):
             kwargs[key] = Path(value)
         else:
             kwargs[key] = tuple(value) if isinstance(value, list) else value
-    return cls(**kwargs)
+    config = cls(**kwargs)  # its own checks first, which say more
+    for key, value in kwargs.items():
+        if not admits(hints[key], value):
+            hint = " (YAML reads 1e-4 as text; write 1.0e-4)" if _is_number_as_text(value) else ""
+            raise ConfigError(f"{where}: {key}={value!r} must be {describe(hints[key])}{hint}.")
+    return config
+
+
+def admits(hint: Any, value: Any) -> bool:
+    """Return whether an option of this type may be this value, as YAML gives it.
+
+    :param hint: type of the option
+    :param value: plain, a list as a list or tuple
+    """
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(admits(argument, value) for argument in arguments)
+    if origin is Literal:
+        return value in arguments
+    if origin in (tuple, list):
+        return isinstance(value, list | tuple) and all(admits(arguments[0], item) for item in value)
+    if origin in (dict, Mapping):
+        return isinstance(value, Mapping) and all(
+            admits(arguments[0], name) and admits(arguments[1], item) for name, item in value.items()
+        )
+    if hint is types.NoneType:
+        return value is None
+    if hint in (int, float):
+        kind = int if hint is int else int | float
+        return isinstance(value, kind) and not isinstance(value, bool)
+    return hint is Any or isinstance(value, hint)
+
+
+def describe(hint: Any) -> str:
+    """Return the type of an option in words.
+
+    :param hint: type of the option
+    """
+    if isinstance(hint, type) and get_origin(hint) is None:
+        return hint.__name__
+    return str(hint).replace("typing.", "").replace("collections.abc.", "")
+
+
+def _is_number_as_text(value: Any) -> bool:
+    try:
+        return isinstance(value, str) and math.isfinite(float(value))
+    except ValueError:
+        return False
 
 
 def _fields(config: Any) -> dict[str, Any]:

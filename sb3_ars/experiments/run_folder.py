@@ -78,12 +78,18 @@ class Run:
     def progress(self) -> pd.DataFrame:
         """Return the log, one row per write; the columns are the logger's keys.
 
-        :raises ConfigError: if ``progress.csv`` is missing or no table
+        :raises ConfigError: if ``progress.csv`` is missing, no table, or holds text among its numbers
         """
         try:
-            return pd.read_csv(self.folder / "progress.csv")
+            progress = pd.read_csv(self.folder / "progress.csv")
         except (OSError, ValueError) as error:
             raise ConfigError(f"{self.folder / 'progress.csv'} cannot be read: {error}") from error
+        for column, kind in progress.dtypes.items():
+            if not pd.api.types.is_numeric_dtype(kind):
+                raise ConfigError(
+                    f"{self.folder / 'progress.csv'} holds text among the numbers of {column!r}; train the run again."
+                )
+        return progress
 
     def evaluations(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
         """Return the evaluations during training, or ``None`` if the run made none.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sb3_ars.config import ARSConfig
-from sb3_ars.errors import ConfigError, check_count, nearest
+from sb3_ars.errors import ConfigError, check_count, check_number, check_path, nearest
 from sb3_ars.experiments.config import (
     EnvConfig,
     PolicyConfig,
@@ -147,7 +147,7 @@ def load_scale(name: str) -> Scale:
     :param name: one of :func:`scale_names`, or the path of a YAML file of your own, which gives it its name
     :raises ConfigError: if there is none of that name, or its file holds what no scale can have
     """
-    path = Path(name)
+    path = check_path("scale", name)
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return _read(path.stem, path, str(path))
     names = scale_names()
@@ -316,7 +316,8 @@ def _check_tasks(scale: Scale) -> None:
 
 def _check_resets(scale: Scale) -> None:
     at = scale.resets_at
-    if at is not None and (not isinstance(at, tuple) or list(at) != sorted(set(at))):
+    is_tuple = isinstance(at, tuple) and all(isinstance(share, int | float) for share in at)
+    if at is not None and not (is_tuple and list(at) == sorted(set(at))):
         raise ConfigError(
             f"scale {scale.name}: resets_at={at!r} must be a list of increasing shares of the run, such as [0.25]."
         )
@@ -331,16 +332,21 @@ def _check_resets(scale: Scale) -> None:
 
 
 def _check_caps(scale: Scale) -> None:
-    numeric = {f.name for config in (*BODIES.values(), LoRAConfig) for f in dataclasses.fields(config)}
-    allowed = [*CAPS, *sorted(numeric)]
+    options = [f for config in (*BODIES.values(), LoRAConfig) for f in dataclasses.fields(config)]
+    shares = {f.name for f in options if isinstance(f.default, float)}
+    counts = {f.name for f in options if isinstance(f.default, int) and not isinstance(f.default, bool)}
+    allowed = [*CAPS, *sorted(shares | counts)]
     for name, value in scale.at_most.items():
         if name not in allowed:
             raise ConfigError(
                 f"scale {scale.name}: at_most has no cap {name!r}; there are {', '.join(allowed)}."
                 + nearest(str(name), allowed)
             )
-        if isinstance(value, bool) or not isinstance(value, int | float) or value < 0:
-            raise ConfigError(f"scale {scale.name}: at_most {name}={value!r} must be a number of at least 0.")
+        option = f"scale {scale.name}: at_most {name}"
+        if name in shares:
+            check_number(option, value, maximum=1)
+        else:
+            check_count(option, value, minimum=0 if name == "hidden_layers" else 1)
 
 
 def _check_options(scale: Scale) -> None:

@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from sb3_ars.errors import ConfigError, nearest
+from sb3_ars.errors import ConfigError, check_path, nearest
 from sb3_ars.experiments.catalogue import preset_names
 from sb3_ars.experiments.config import read_yaml
 
@@ -98,7 +98,7 @@ def load_sweep(name: str) -> Sweep:
     :param name: one of :func:`sweep_names`, or the path of a YAML file of your own
     :raises ConfigError: if there is none of that name, or its file has an unknown or missing key, kind or preset
     """
-    path = Path(name)
+    path = check_path("table or figure", name)
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return _sweep(path.stem, path, str(path))
     names = sweep_names()

@@ -84,6 +84,8 @@ class Objective:
         scale: str,
         n_trials: int | None = None,
     ) -> None:
+        if not isinstance(preset, str | RunConfig):
+            raise ConfigError(f"preset={preset!r} must be a preset's name, or a RunConfig.")
         self.preset = preset if isinstance(preset, str) else "custom"
         self.config = scaled(load_preset(preset) if isinstance(preset, str) else preset, load_scale(scale))
         self.space = load_search_space(space)

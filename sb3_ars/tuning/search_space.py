@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import types
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import optuna
 from optuna.distributions import (
@@ -19,8 +19,8 @@ from optuna.distributions import (
     IntDistribution,
 )
 
-from sb3_ars.errors import ConfigError, nearest
-from sb3_ars.experiments.config import RunConfig, read_yaml
+from sb3_ars.errors import ConfigError, check_flag, check_path, nearest
+from sb3_ars.experiments.config import RunConfig, admits, describe, read_yaml
 
 __all__ = ["SearchSpace", "TunedOption", "load_search_space", "search_space_names"]
 
@@ -113,6 +113,9 @@ class TunedOption:
             raise ConfigError(f"{self.name}: choices go with type categorical, not with {self.type}.")
         for bound in ("low", "high", *(("step",) if self.step is not None else ())):
             self._check_number(bound, getattr(self, bound))
+        check_flag(f"{self.name}: log", self.log)
+        if self.step is not None and self.step <= 0:
+            raise ConfigError(f"{self.name}: step={self.step!r} must be above 0.")
         assert self.low is not None and self.high is not None
         try:
             if self.type == "int":
@@ -139,8 +142,8 @@ class TunedOption:
 
     def _check_number(self, bound: str, value: Any) -> None:
         kind = int if self.type == "int" else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kind):
-            what = "an integer" if self.type == "int" else "a number"
+        if isinstance(value, bool) or not isinstance(value, kind) or not math.isfinite(value):
+            what = "an integer" if self.type == "int" else "a finite number"
             hint = " (YAML reads 1e-4 as text; write 1.0e-4)" if isinstance(value, str) else ""
             raise ConfigError(f"{self.name}: {bound}={value!r} must be {what}{hint}.")
 
@@ -241,6 +244,7 @@ def load_search_space(space: str | Path | Mapping[str, Any] | SearchSpace) -> Se
         return space
     if isinstance(space, Mapping):
         return _build(space, "search space", "custom")
+    check_path("space", space)
     if str(space) in search_space_names():
         text = (_SPACES / f"{space}.yaml").read_text(encoding="utf-8")
         return _build(read_yaml(text, str(space)), str(space), str(space))
@@ -295,9 +299,9 @@ def _check_option(option: TunedOption) -> None:
     number = {"int": int, "float": float}.get(option.type)
     values = option.choices if number is None else (number(option.low or 0), number(option.high or 0))
     for value in values:
-        if not _admits(hint, value):
+        if not admits(hint, value):
             raise ConfigError(
-                f"{option.name} cannot be {value!r} (type {option.type}): it takes {_describe(hint)}."
+                f"{option.name} cannot be {value!r} (type {option.type}): it takes {describe(hint)}."
             )
 
 
@@ -310,34 +314,6 @@ def _option_hints(cls: Any, prefix: str = "") -> dict[str, Any]:
         else:
             hints[prefix + name] = hint
     return hints
-
-
-def _admits(hint: Any, value: Any) -> bool:
-    """Return whether an option of this type may be this value, as YAML gives it."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return any(_admits(argument, value) for argument in arguments)
-    if origin is Literal:
-        return value in arguments
-    if origin in (tuple, list):
-        return isinstance(value, list | tuple) and all(_admits(arguments[0], item) for item in value)
-    if origin is dict:
-        return isinstance(value, Mapping)
-    if hint is types.NoneType:
-        return value is None
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    return isinstance(value, hint)
-
-
-def _describe(hint: Any) -> str:
-    return (
-        hint.__name__
-        if isinstance(hint, type) and get_origin(hint) is None
-        else str(hint).replace("typing.", "")
-    )
 
 
 def _label(choice: Any) -> Any:

@@ -15,7 +15,7 @@ from optuna.exceptions import ExperimentalWarning, UpdateFinishedTrialError
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, WilcoxonPruner
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_ars.errors import ConfigError, check_count, nearest
+from sb3_ars.errors import ConfigError, check_count, check_path, nearest
 from sb3_ars.experiments.config import RunConfig
 from sb3_ars.tuning.liveness import counts, fail_dead_trials, is_dead
 from sb3_ars.tuning.objective import Objective, Space, TrialFailed, plain_config
@@ -75,8 +75,18 @@ def tune(
         study was started with other options
     """
     n_trials = check_count("n_trials (--n-trials)", n_trials)
-    if timeout is not None and not timeout > 0:
-        raise ConfigError(f"timeout (--timeout) is {timeout:g} s, but must be more than 0.")
+    is_number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
+    if timeout is not None and not (is_number and timeout > 0):
+        raise ConfigError(
+            f"timeout (--timeout) is {f'{timeout:g}' if is_number else repr(timeout)} s, but must be more than 0."
+        )
+    if name is not None and not (isinstance(name, str) and name and name == Path(name).name):
+        raise ConfigError(
+            f"name (--study)={name!r} must be the name of a folder in --output, without slashes."
+        )
+    output = check_path("output (--output)", output)
+    if not isinstance(callbacks, list | tuple):
+        raise ConfigError(f"callbacks={callbacks!r} must be a list of functions of study and trial.")
     space = load_search_space(space)
     objective = Objective(
         preset,

@@ -108,7 +108,7 @@ def gather(folders: Sequence[Path], expected: Iterable[Cell] = ()) -> Gathered:
     if not runs:
         raise ConfigError(
             f"No finished run in {', '.join(map(str, folders))}; a finished run's folder holds {RESULT}."
-            + "".join(f"\n  {warning}" for warning in warnings)
+            + "".join(f" {warning}" for warning in warnings)
         )
     arms = _arms(_newest(runs, warnings))
     found = {(run.config.scale, run.name, run.seed) for run in runs if not _stop(run)}
