@@ -242,11 +242,18 @@ def check_same_options(model: MultiTaskOffPolicyAlgorithm, options: Mapping[str,
     now = _options_of(model)
     for name in sorted({*options, *now} - {"missing"}):
         before, after = unpack(options.get(name)), unpack(now.get(name))
-        if before != after:
+        if _listed(before) != _listed(after):
             raise CheckpointError(
                 f"The run was trained with {name}={before!r}, and is now to go on with {after!r}; put its config.yaml "
                 "back as it was."
             )
+
+
+def _listed(value: Any) -> Any:
+    """Return a value with its tuples as lists: a configuration's file knows no tuples."""
+    if isinstance(value, Mapping):
+        return {key: _listed(item) for key, item in value.items()}
+    return [_listed(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def constructor_arguments(options: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
