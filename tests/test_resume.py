@@ -656,3 +656,20 @@ def test_two_processes_do_not_write_into_one_folder(tmp_path):
         other.communicate()
     with lock(tmp_path):
         short(tmp_path)  # this process may
+
+
+@pytest.mark.metaworld
+def test_every_metaworld_task_goes_on_in_the_middle_of_an_episode():
+    before, after = (
+        make_metaworld_env("MT50", seed=0, n_workers=workers, max_episode_steps=40) for workers in (0, 2)
+    )
+    actions = np.random.default_rng(0).uniform(-1, 1, (110, 50, 4)).astype(np.float32)
+    before.reset()
+    for action in actions[:65]:  # 25 steps into the second episode
+        obs = before.step(action)[0]
+    assert np.array_equal(after.restore_checkpoint_state(before.checkpoint_state()), obs)
+    for action in actions[65:]:
+        for a, b in zip(before.step(action)[:3], after.step(action)[:3], strict=True):
+            assert np.array_equal(a, b)
+    for env in (before, after):
+        env.close()
