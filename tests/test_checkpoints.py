@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_ars import ARSSAC, CheckpointError, ConfigError, RunCheckpoint, make_toy_env
+from sb3_ars import ARSSAC, CheckpointError, ConfigError, make_toy_env
 from sb3_ars.checkpoints import CheckpointFolder, HashingFile, latest_checkpoint
 from sb3_ars.plain import pack, unpack
 from tests.test_resume import (
-    OPTIONS,
     Stop,
     assert_same,
     checkpoints,
@@ -455,9 +454,3 @@ def test_a_writer_killed_anywhere_leaves_nothing_unusable(tmp_path, operation):
         found = everything(model)
         assert_same(run_whole(make)[1], found)
     assert not list((tmp_path / "c").rglob("*.writing"))
-
-
-def test_options_name_what_they_refuse(tmp_path):
-    with pytest.raises(ConfigError, match="every="):
-        RunCheckpoint(tmp_path, every=-1)
-    assert CheckpointFolder(tmp_path).keep == 2 and OPTIONS["seed"] == 0
